@@ -230,11 +230,7 @@ mod tests {
     use crate::config::Head;
 
     fn count(config: &ModelConfig, prefixes: &[&str]) -> usize {
-        tensors(config)
-            .iter()
-            .filter(|t| prefixes.iter().any(|p| t.name.starts_with(p)))
-            .map(TensorSpec::len)
-            .sum()
+        tensors(config).iter().filter(|t| prefixes.iter().any(|p| t.name.starts_with(p))).map(TensorSpec::len).sum()
     }
 
     /// Self-check 1 of the network specification: published parameter counts.
@@ -262,10 +258,7 @@ mod tests {
         assert_eq!(parameters(&full), 1_085_252_555);
 
         // VGGT's depth head: 2048 wide, two outputs.
-        let vggt = ModelConfig {
-            gs: Head { out: 2, ..ModelConfig::full().gs },
-            ..ModelConfig::full()
-        };
+        let vggt = ModelConfig { gs: Head { out: 2, ..ModelConfig::full().gs }, ..ModelConfig::full() };
         assert_eq!(count(&vggt, &["gs_head."]), 32_654_562);
 
         let base = ModelConfig::base().with_linear_heads();

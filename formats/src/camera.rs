@@ -209,12 +209,8 @@ mod tests {
         // mu = R_c (K^-1 u D) + t_c with camera-to-world, are the same point, which projects back
         // to its own pixel.
         let c2w = pose(DVec3::new(0.3, -1.0, 0.2), 0.7, DVec3::new(4.0, -2.0, 9.0));
-        let camera = Camera {
-            width: 252,
-            height: 168,
-            k: Intrinsics { fx: 210.0, fy: 205.0, cx: 126.0, cy: 84.0 },
-            pose: c2w,
-        };
+        let camera =
+            Camera { width: 252, height: 168, k: Intrinsics { fx: 210.0, fy: 205.0, cx: 126.0, cy: 84.0 }, pose: c2w };
         let (u, v, d) = (30.5, 77.5, 12.25);
         let ray = DVec3::new((u - 126.0) / 210.0, (v - 84.0) / 205.0, 1.0) * d;
         let w2c = c2w.inverse();

@@ -663,13 +663,12 @@ impl ModelConfig {
                 match self.pairs.get(key) {
                     Some(v) => {
                         self.seen += 1;
-                        *slot = T::from_value(v)
-                            .ok_or_else(|| Error::model(self.at, format!("configuration {key} = {v:?} is not valid")))?;
+                        *slot = T::from_value(v).ok_or_else(|| {
+                            Error::model(self.at, format!("configuration {key} = {v:?} is not valid"))
+                        })?;
                         Ok(())
                     }
-                    None if self.complete => {
-                        Err(Error::model(self.at, format!("configuration {key} is missing")))
-                    }
+                    None if self.complete => Err(Error::model(self.at, format!("configuration {key} is missing"))),
                     None => Ok(()),
                 }
             }
@@ -710,8 +709,8 @@ impl ModelConfig {
 
     /// From a flat JSON object; missing keys keep the defaults of [`ModelConfig::base`].
     pub fn from_json(text: &str, at: &str) -> Result<Self> {
-        let json: serde_json::Value = serde_json::from_str(text)
-            .map_err(|e| Error::model(at, format!("configuration is not JSON: {e}")))?;
+        let json: serde_json::Value =
+            serde_json::from_str(text).map_err(|e| Error::model(at, format!("configuration is not JSON: {e}")))?;
         let map = json.as_object().ok_or_else(|| Error::model(at, "configuration is not a JSON object"))?;
         let mut pairs = BTreeMap::new();
         for (k, v) in map {

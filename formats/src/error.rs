@@ -154,8 +154,7 @@ impl Error {
 
     /// The message as one line of at most 300 bytes, as the command line prints it.
     pub fn line(&self) -> String {
-        let mut line: String =
-            self.to_string().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+        let mut line: String = self.to_string().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
         if line.len() > 300 {
             let mut end = 297;
             while !line.is_char_boundary(end) {
@@ -186,11 +185,7 @@ pub fn escape(bytes: &[u8]) -> String {
 
 /// A path for a message: the last part is what a reader looks for, so a long path loses its head.
 pub fn escape_path(path: &Path) -> String {
-    let shown: String = path
-        .to_string_lossy()
-        .chars()
-        .map(|c| if c.is_control() { '?' } else { c })
-        .collect();
+    let shown: String = path.to_string_lossy().chars().map(|c| if c.is_control() { '?' } else { c }).collect();
     if shown.chars().count() <= 120 {
         return shown;
     }

@@ -95,13 +95,7 @@ pub struct Compose {
 
 impl Default for Compose {
     fn default() -> Self {
-        Compose {
-            window: 1,
-            own: SelfRule::Own,
-            extrapolate: Extrapolate::Mirror,
-            split: Split::Hard,
-            tau: 0.5,
-        }
+        Compose { window: 1, own: SelfRule::Own, extrapolate: Extrapolate::Mirror, split: Split::Hard, tau: 0.5 }
     }
 }
 
@@ -300,12 +294,8 @@ mod tests {
 
     /// Three frames a second apart, one dynamic Gaussian each (frame index as its x), one static.
     fn scene() -> Scene {
-        let camera = Camera {
-            width: 8,
-            height: 8,
-            k: Intrinsics { fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0 },
-            pose: Pose::IDENTITY,
-        };
+        let camera =
+            Camera { width: 8, height: 8, k: Intrinsics { fx: 8.0, fy: 8.0, cx: 4.0, cy: 4.0 }, pose: Pose::IDENTITY };
         let frames = (0..3)
             .map(|f| SceneFrame { time: f64::from(f), camera, source_size: (8, 8), name: String::new() })
             .collect();
