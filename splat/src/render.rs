@@ -1,0 +1,361 @@
+//! Images of Gaussians: [`Renderer`] keeps memory and threads between images.
+//!
+//! Three parallel steps with a barrier each: project (16 runs of the scene), bin (the same runs), blend
+//! (tiles). A tile is owned by one thread and written to the image by it.
+
+use std::sync::{Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
+
+use sf_formats::scene::{Gaussians, SplatSettings};
+use sf_formats::{Camera, Error, Result};
+
+use crate::bin::{self, GROUPS, Group};
+use crate::blend::{Channels, Place, Tile};
+use crate::project::{self, Counts, Projector, TILE};
+
+/// Further values per Gaussian, composited like colour but without a background: velocity, dynamic
+/// probability, class scores.
+#[derive(Clone, Copy, Debug)]
+pub struct Extra<'a> {
+    /// Values per Gaussian.
+    pub channels: usize,
+    /// Row-major `[gaussians, channels]`. A Gaussian with a value that is not finite is dropped.
+    pub values: &'a [f32],
+}
+
+/// What to draw besides the scene.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderOptions<'a> {
+    /// Colour behind everything, weighted by what is left of T. Default black.
+    pub background: [f32; 3],
+    /// Further channels.
+    pub extra: Option<Extra<'a>>,
+    /// Most pairs of a Gaussian and a tile; checked before memory is taken for them (8 bytes each).
+    /// Default 2^26.
+    pub max_entries: u64,
+}
+
+impl Default for RenderOptions<'_> {
+    fn default() -> Self {
+        RenderOptions { background: [0.0; 3], extra: None, max_entries: 1 << 26 }
+    }
+}
+
+/// Counts of one image.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Stats {
+    /// Gaussians in the scene.
+    pub gaussians: u64,
+    /// Gaussians that reach a pixel centre with an alpha of 1/255 or more (occlusion aside).
+    pub visible: u64,
+    /// Pairs of a visible Gaussian and a 32x32 tile.
+    pub entries: u64,
+    /// Dropped: NaN or infinity in a field.
+    pub dropped_nonfinite: u64,
+    /// Dropped: negative scale.
+    pub dropped_scale: u64,
+    /// Dropped: quaternion of length zero.
+    pub dropped_quaternion: u64,
+    /// Dropped: projected covariance without a positive determinant (only without a low-pass).
+    pub dropped_singular: u64,
+    /// Drawn with a scale clamped to 1e-20..=1e10.
+    pub clamped_scale: u64,
+    /// Drawn with an opacity clamped to 0..=1.
+    pub clamped_opacity: u64,
+}
+
+impl Stats {
+    /// Gaussians that were dropped for what they hold, not for where they are.
+    pub fn dropped(&self) -> u64 {
+        self.dropped_nonfinite + self.dropped_scale + self.dropped_quaternion + self.dropped_singular
+    }
+
+    /// More than 1 % were dropped: the picture should not be trusted.
+    pub fn degraded(&self) -> bool {
+        self.dropped() * 100 > self.gaussians
+    }
+}
+
+/// An image with its depth and coverage, row-major.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Rendered {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Colour `[height, width, 3]`, background included, not clamped.
+    pub rgb: Vec<f32>,
+    /// D = sum T alpha z `[height, width]`: depth weighted by coverage, scene units.
+    pub depth: Vec<f32>,
+    /// Coverage 1 - T `[height, width]`, 0..=1 - 1e-4.
+    pub alpha: Vec<f32>,
+    /// Number of extra channels.
+    pub channels: usize,
+    /// Extra channels `[height, width, channels]`, sum T alpha value.
+    pub extra: Vec<f32>,
+    /// Counts.
+    pub stats: Stats,
+}
+
+impl Rendered {
+    /// Depth of what is seen, D / max(alpha, 1e-10) `[height, width]`; 0 where nothing is.
+    pub fn expected_depth(&self) -> Vec<f32> {
+        self.depth.iter().zip(&self.alpha).map(|(d, a)| d / a.max(1e-10)).collect()
+    }
+
+    fn resize(&mut self, width: usize, height: usize, channels: usize) -> Result<()> {
+        let pixels = width * height;
+        for (image, planes) in
+            [(&mut self.rgb, 3), (&mut self.depth, 1), (&mut self.alpha, 1), (&mut self.extra, channels)]
+        {
+            let len = pixels.checked_mul(planes);
+            image.clear();
+            len.and_then(|len| image.try_reserve_exact(len).ok().map(|()| image.resize(len, 0.0))).ok_or_else(
+                || Error::resource("render", format!("no memory for a {width}x{height} image of {planes} channels")),
+            )?;
+        }
+        (self.width, self.height, self.channels) = (width, height, channels);
+        Ok(())
+    }
+}
+
+/// Draws one image on the calling thread. For many images keep a [`Renderer`].
+pub fn render(
+    scene: &Gaussians,
+    camera: &Camera,
+    settings: &SplatSettings,
+    options: &RenderOptions,
+) -> Result<Rendered> {
+    Renderer::new(1)?.render(scene, camera, settings, options)
+}
+
+/// Draws images, keeping memory between them.
+#[derive(Debug)]
+pub struct Renderer {
+    threads: usize,
+    groups: [RwLock<Group>; GROUPS],
+    tiles: Vec<Mutex<Tile>>,
+}
+
+impl Renderer {
+    /// A renderer with its own threads, at least one.
+    pub fn new(threads: usize) -> Result<Renderer> {
+        let threads = threads.max(1);
+        Ok(Renderer {
+            threads,
+            groups: std::array::from_fn(|_| RwLock::default()),
+            tiles: (0..threads).map(|_| Mutex::default()).collect(),
+        })
+    }
+
+    /// Draws an image.
+    ///
+    /// # Errors
+    /// Status 3 for a bad camera, setting or scene layout; 5 for a side over 16384 pixels, more entries
+    /// than `options.max_entries`, or no memory.
+    pub fn render(
+        &mut self,
+        scene: &Gaussians,
+        camera: &Camera,
+        settings: &SplatSettings,
+        options: &RenderOptions,
+    ) -> Result<Rendered> {
+        let mut out = Rendered::default();
+        self.render_into(scene, camera, settings, options, &mut out)?;
+        Ok(out)
+    }
+
+    /// [`Renderer::render`] into images whose memory is kept. After an error `out` holds no image.
+    pub fn render_into(
+        &mut self,
+        scene: &Gaussians,
+        camera: &Camera,
+        settings: &SplatSettings,
+        options: &RenderOptions,
+        out: &mut Rendered,
+    ) -> Result<()> {
+        camera.check("camera")?;
+        project::check_settings(settings)?;
+        check_scene(scene)?;
+        let extra = check_extra(scene, options.extra)?;
+        if !options.background.iter().all(|v| v.is_finite()) {
+            return Err(Error::usage(format!("background {:?} must be finite", options.background)));
+        }
+        let columns = camera.width.div_ceil(TILE);
+        let rows = camera.height.div_ceil(TILE);
+        let stats = self.project(scene, &Projector::new(camera, settings), extra);
+        let limit = options.max_entries.min(u64::from(u32::MAX));
+        if stats.entries > limit {
+            return Err(Error::resource(
+                "render",
+                format!(
+                    "{} visible Gaussians meet {} tiles in all, over the limit of {limit}: \
+                     use a smaller image, fewer or smaller Gaussians, or a higher limit",
+                    stats.visible, stats.entries
+                ),
+            ));
+        }
+        out.resize(camera.width as usize, camera.height as usize, extra.channels)?;
+        out.stats = stats;
+        let groups = &self.groups;
+        parallel(self.threads, GROUPS, &|g, _| write(&groups[g]).bin(g, (columns, rows)));
+        self.blend((columns, rows), (settings.a_max, options.background), extra, out);
+        Ok(())
+    }
+
+    /// Projects all groups and sums their counts.
+    fn project(&mut self, scene: &Gaussians, projector: &Projector, extra: Channels) -> Stats {
+        let usable = |i: usize| extra.values[i * extra.channels..][..extra.channels].iter().all(|v| v.is_finite());
+        let groups = &self.groups;
+        parallel(self.threads, GROUPS, &|g, _| {
+            write(&groups[g]).project(projector, scene, bin::run(scene.len(), g), &usable);
+        });
+        let mut counts = Counts::default();
+        let mut stats = Stats { gaussians: scene.len() as u64, ..Stats::default() };
+        for group in &self.groups {
+            let group = read(group);
+            counts.add(&group.counts);
+            stats.visible += group.records.len() as u64;
+            stats.entries += group.entries;
+        }
+        Stats {
+            dropped_nonfinite: counts.nonfinite,
+            dropped_scale: counts.negative_scale,
+            dropped_quaternion: counts.zero_quaternion,
+            dropped_singular: counts.singular,
+            clamped_scale: counts.clamped_scale,
+            clamped_opacity: counts.clamped_opacity,
+            ..stats
+        }
+    }
+
+    /// Blends all tiles into the image.
+    fn blend(
+        &self,
+        (columns, rows): (u32, u32),
+        (a_max, background): (f32, [f32; 3]),
+        extra: Channels,
+        out: &mut Rendered,
+    ) {
+        let (width, height, channels) = (out.width, out.height, out.channels);
+        let side = TILE as usize;
+        // Tiles of one row of tiles share a band of the image; each writes its columns under the lock.
+        let band = |planes: usize| (side * width * planes).max(1);
+        let mut extra_bands = out.extra.chunks_mut(band(channels));
+        let bands: Vec<Mutex<Band>> = out
+            .rgb
+            .chunks_mut(band(3))
+            .zip(out.depth.chunks_mut(band(1)))
+            .zip(out.alpha.chunks_mut(band(1)))
+            .map(|((rgb, depth), alpha)| {
+                Mutex::new(Band { rgb, depth, alpha, extra: extra_bands.next().unwrap_or_default() })
+            })
+            .collect();
+        parallel(self.threads, (columns * rows) as usize, &|t, worker| {
+            let groups: [RwLockReadGuard<Group>; GROUPS] = std::array::from_fn(|g| read(&self.groups[g]));
+            let mut tile = lock(&self.tiles[worker]);
+            let (tx, ty) = (t % columns as usize, t / columns as usize);
+            let place = Place {
+                x: tx * side,
+                y: ty * side,
+                width: side.min(width - tx * side),
+                height: side.min(height - ty * side),
+            };
+            tile.clear(place, channels);
+            for group in &groups {
+                tile.push(group.tile(t));
+            }
+            tile.blend(place, a_max, extra, |key| {
+                let (group, record) = bin::locate(key);
+                &groups[group].records[record]
+            });
+            lock(&bands[ty]).store(&tile, place, (width, channels), background);
+        });
+    }
+}
+
+/// The part of every image that one row of tiles covers.
+struct Band<'a> {
+    rgb: &'a mut [f32],
+    depth: &'a mut [f32],
+    alpha: &'a mut [f32],
+    extra: &'a mut [f32],
+}
+
+impl Band<'_> {
+    fn store(&mut self, tile: &Tile, place: Place, (width, channels): (usize, usize), background: [f32; 3]) {
+        for y in 0..place.height {
+            let row = y * width + place.x;
+            for x in 0..place.width {
+                let (t, [r, g, b, z]) = tile.pixel(x, y);
+                let rgb = &mut self.rgb[(row + x) * 3..][..3];
+                for (out, (sum, behind)) in rgb.iter_mut().zip([r, g, b].into_iter().zip(background)) {
+                    *out = sum + t * behind;
+                }
+                self.depth[row + x] = z;
+                self.alpha[row + x] = 1.0 - t;
+            }
+            let values = tile.extra_row(y, place.width, channels);
+            self.extra[row * channels..][..values.len()].copy_from_slice(values);
+        }
+    }
+}
+
+fn check_scene(scene: &Gaussians) -> Result<()> {
+    let n = scene.len();
+    let fields = [scene.scale.len(), scene.quat.len(), scene.opacity.len(), scene.colour.len()];
+    if fields.iter().any(|&len| len != n) {
+        return Err(Error::input(
+            "scene",
+            format!("{n} means but {fields:?} scales, quaternions, opacities, colours: all must be equal"),
+        ));
+    }
+    if n > bin::MAX_GAUSSIANS {
+        return Err(Error::resource("scene", format!("{n} Gaussians, limit {}", bin::MAX_GAUSSIANS)));
+    }
+    Ok(())
+}
+
+fn check_extra<'a>(scene: &Gaussians, extra: Option<Extra<'a>>) -> Result<Channels<'a>> {
+    let Some(Extra { channels, values }) = extra else { return Ok(Channels { channels: 0, values: &[] }) };
+    if channels.checked_mul(scene.len()) != Some(values.len()) {
+        return Err(Error::input(
+            "extra channels",
+            format!("{} values for {} Gaussians of {channels} channels", values.len(), scene.len()),
+        ));
+    }
+    Ok(Channels { channels, values })
+}
+
+// A poisoned lock means that a task panicked; its panic has already reached the caller, and every
+// image starts by clearing what it uses.
+fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
+    lock.read().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
+    lock.write().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Runs `f(task, worker)` for every task, tasks taken from a counter.
+fn parallel(threads: usize, tasks: usize, f: &(dyn Fn(usize, usize) + Sync)) {
+    let next = std::sync::atomic::AtomicUsize::new(0);
+    let work = |worker: usize| {
+        loop {
+            let task = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            if task >= tasks {
+                break;
+            }
+            f(task, worker);
+        }
+    };
+    std::thread::scope(|scope| {
+        for worker in 1..threads.min(tasks) {
+            scope.spawn(move || work(worker));
+        }
+        work(0);
+    });
+}
