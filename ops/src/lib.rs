@@ -1,1 +1,38 @@
-//! To be written.
+//! Kernels of the network: they know slices and shapes, not files and not the model.
+//!
+//! | file | what |
+//! |---|---|
+//! | `mat.rs` | [`Mat`](mat::Mat), [`Hwc`](mat::Hwc): borrowed matrices and images |
+//! | `par.rs` | [`Pool`](par::Pool): the threads; the only file that makes any |
+//! | `cpu.rs` | [`Features`](cpu::Features), [`Isa`](cpu::Isa), [`Kernels`](cpu::Kernels), [`Ctx`](cpu::Ctx): what this CPU can do and which rows follow |
+//! | `simd/` | 16-lane vectors, one file per instruction set, and the table of vector kernels |
+//! | `gemm/` | matrix product with f32 or f16 weights in K1N16 panels; its table and packers |
+//! | `attention.rs` | frame-masked attention with streaming softmax |
+//! | `conv.rs` | convolution and transposed convolution through the panels |
+//! | `layernorm.rs` `rope.rs` | norms and rotary embedding |
+//! | `activation.rs` `elementwise.rs` | exp, sigmoid, erf, gelu; sums, pixel shuffle |
+//! | `resize.rs` | bilinear maps, Pillow's 8-bit resize, position tables |
+//! | `trig.rs` | f64 sin, cos, exp, ln for tables |
+//! | `reference.rs` | the definition of every op in plain loops |
+//!
+//! Activations are f32, row-major, channels last. Shape mistakes are programmer errors and panic with the
+//! numbers.
+#![deny(unsafe_code)]
+
+pub mod activation;
+pub mod attention;
+pub mod conv;
+pub mod cpu;
+pub mod elementwise;
+pub mod gemm;
+pub mod layernorm;
+pub mod mat;
+pub mod par;
+pub mod reference;
+pub mod resize;
+pub mod rope;
+pub mod simd;
+pub mod trig;
+
+pub use cpu::{Ctx, Kernels};
+pub use mat::{Hwc, HwcMut, Mat, MatMut};

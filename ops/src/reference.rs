@@ -1,0 +1,314 @@
+//! The definition of every op: plain loops over slices, no dispatch, no threads, no tiles.
+//!
+//! Values are f32, sums are kept in f64 and rounded once, `exp`, `erf` and roots are the f64 ones of the
+//! platform or of [`crate::trig`]; so these results are closer to the exact ones than any f32 kernel and
+//! serve as oracle for all of them. Weights come in the order of a checkpoint (`[out, in]`,
+//! `[out, in, kh, kw]`, `[in, out, k, k]`), so that packing is judged too. Not bit-equal to the fast ops.
+
+use crate::attention::FrameMask;
+use crate::gemm::Act;
+use crate::mat::{Hwc, Mat};
+use crate::resize::Corners;
+use crate::rope::{QkNorm, RopeTable};
+use crate::trig;
+
+/// x W^T + b: `x` `[rows, k]`, `w` `[n, k]`, `bias` `[n]` -> `[rows, n]`.
+pub fn linear(x: Mat, w: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
+    let n = w.len().checked_div(x.cols).unwrap_or(0);
+    assert_eq!(w.len(), n * x.cols, "weights of {} inputs", x.cols);
+    let mut out = Vec::with_capacity(x.rows * n);
+    for r in 0..x.rows {
+        let row = x.row(r);
+        for j in 0..n {
+            let wj = &w[j * x.cols..][..x.cols];
+            let mut sum = 0.0f64;
+            for (a, b) in row.iter().zip(wj) {
+                sum += f64::from(*a) * f64::from(*b);
+            }
+            out.push((sum + bias.map_or(0.0, |b| f64::from(b[j]))) as f32);
+        }
+    }
+    out
+}
+
+/// (x - mean) / sqrt(var + eps) * gain + offset per row, var with divisor `cols`; `[rows, cols]`.
+pub fn layernorm(x: Mat, gain: &[f32], offset: &[f32], eps: f32) -> Vec<f32> {
+    let mut out = Vec::with_capacity(x.rows * x.cols);
+    for r in 0..x.rows {
+        let row = x.row(r);
+        let n = x.cols as f64;
+        let mean = row.iter().map(|&v| f64::from(v)).sum::<f64>() / n;
+        let var = row.iter().map(|&v| (f64::from(v) - mean).powi(2)).sum::<f64>() / n;
+        let scale = 1.0 / (var + f64::from(eps)).sqrt();
+        for c in 0..x.cols {
+            out.push(((f64::from(row[c]) - mean) * scale * f64::from(gain[c]) + f64::from(offset[c])) as f32);
+        }
+    }
+    out
+}
+
+/// max(x, 0); NaN stays.
+pub fn relu(x: f32) -> f32 {
+    if x < 0.0 { 0.0 } else { x }
+}
+
+/// 1 / (1 + e^-x).
+pub fn sigmoid(x: f32) -> f32 {
+    (1.0 / (1.0 + trig::exp(-f64::from(x)))) as f32
+}
+
+/// e^x.
+pub fn exp(x: f32) -> f32 {
+    trig::exp(f64::from(x)) as f32
+}
+
+/// Error function in f64: 2/sqrt(pi) times the integral of e^(-t^2) from 0 to x, by its power series below 3
+/// and by the continued fraction of erfc above; about 1e-15 absolute.
+pub fn erf(x: f64) -> f64 {
+    1.0 - erfc(x)
+}
+
+/// 1 - erf(x), accurate relative to itself where x > 3.
+pub fn erfc(x: f64) -> f64 {
+    if x.is_nan() {
+        return x;
+    }
+    let z = x.abs();
+    let positive = if z < 3.0 {
+        // erf(z) = 2/sqrt(pi) e^(-z^2) sum 2^n z^(2n+1) / (2n+1)!!, all terms positive.
+        let (mut term, mut sum) = (z, z);
+        let mut n = 1.0;
+        while term > sum * 1e-18 {
+            term *= 2.0 * z * z / (2.0 * n + 1.0);
+            sum += term;
+            n += 1.0;
+        }
+        1.0 - std::f64::consts::FRAC_2_SQRT_PI * trig::exp(-z * z) * sum
+    } else {
+        // erfc(z) = e^(-z^2)/sqrt(pi) / (z + (1/2)/(z + (2/2)/(z + (3/2)/...))).
+        let mut tail = z;
+        for k in (1..=60).rev() {
+            tail = z + 0.5 * f64::from(k) / tail;
+        }
+        trig::exp(-z * z) * 0.5 * std::f64::consts::FRAC_2_SQRT_PI / tail
+    };
+    if x < 0.0 { 2.0 - positive } else { positive }
+}
+
+/// x Phi(x) with the exact normal distribution function (the erf form).
+pub fn gelu(x: f32) -> f32 {
+    let x = f64::from(x);
+    if x == f64::NEG_INFINITY {
+        return 0.0;
+    }
+    (0.5 * x * erfc(-x * std::f64::consts::FRAC_1_SQRT_2)) as f32
+}
+
+/// The activation of an epilogue.
+pub fn activate(x: f32, act: Act) -> f32 {
+    match act {
+        Act::None => x,
+        Act::Gelu => gelu(x),
+        Act::Relu => relu(x),
+    }
+}
+
+/// Per-head layer norm of q and k, then 2-D rotary embedding, in place. `qkv` is `[rows, 3 * heads * d]`;
+/// row r uses table entry r modulo the table's length.
+///
+/// Each head's d channels are two halves, the first turned by the row position, the second by the column;
+/// inside a half of size D channel m pairs with m + D/2.
+pub fn qk_norm_rope(qkv: &mut [f32], rows: usize, heads: usize, norm: Option<&QkNorm>, rope: Option<&RopeTable>) {
+    if rows == 0 {
+        return;
+    }
+    let width = qkv.len() / rows;
+    let d = width / (3 * heads);
+    assert_eq!(qkv.len(), rows * 3 * heads * d, "{rows} rows of 3 x {heads} heads");
+    for r in 0..rows {
+        for part in 0..2 {
+            for h in 0..heads {
+                let x = &mut qkv[r * width + (part * heads + h) * d..][..d];
+                if let Some(n) = norm {
+                    let (gain, offset) = if part == 0 { (n.q_gain, n.q_offset) } else { (n.k_gain, n.k_offset) };
+                    let y = layernorm(Mat::new(x, 1, d), gain, offset, n.eps);
+                    x.copy_from_slice(&y);
+                }
+                if let Some(table) = rope {
+                    let (cos, sin) = table.entry(r % table.len());
+                    let quarter = d / 4;
+                    for half in 0..2 {
+                        for m in 0..quarter {
+                            let (i, j, t) = (half * 2 * quarter + m, (half * 2 + 1) * quarter + m, half * quarter + m);
+                            let (a, b) = (f64::from(x[i]), f64::from(x[j]));
+                            let (c, s) = (f64::from(cos[t]), f64::from(sin[t]));
+                            x[i] = (a * c - b * s) as f32;
+                            x[j] = (b * c + a * s) as f32;
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// softmax(q k^T / sqrt(d)) v under a frame mask; `qkv` `[frames * tokens, 3 * heads * d]` ->
+/// `[frames * tokens, heads * d]`. A query without any key gives exactly 0.
+pub fn attention(qkv: Mat, heads: usize, mask: FrameMask) -> Vec<f32> {
+    let rows = mask.frames * mask.tokens;
+    assert_eq!(qkv.rows, rows, "{} frames of {} tokens", mask.frames, mask.tokens);
+    let c = qkv.cols / 3;
+    let d = c / heads;
+    assert_eq!(qkv.cols, 3 * heads * d, "{} columns for {heads} heads", qkv.cols);
+    let scale = 1.0 / (d as f64).sqrt();
+    let mut out = vec![0.0; rows * c];
+    for q in 0..rows {
+        let frame = q / mask.tokens;
+        for h in 0..heads {
+            let qv = &qkv.row(q)[h * d..][..d];
+            let keys: Vec<usize> = (0..rows).filter(|&k| mask.sees(frame, k / mask.tokens)).collect();
+            let scores: Vec<f64> = keys
+                .iter()
+                .map(|&k| {
+                    let kv = &qkv.row(k)[c + h * d..][..d];
+                    qv.iter().zip(kv).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>() * scale
+                })
+                .collect();
+            let top = scores.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let weights: Vec<f64> = scores.iter().map(|s| trig::exp(s - top)).collect();
+            let total: f64 = weights.iter().sum();
+            for i in 0..d {
+                let sum: f64 =
+                    keys.iter().zip(&weights).map(|(&k, w)| w * f64::from(qkv.row(k)[2 * c + h * d + i])).sum();
+                out[q * c + h * d + i] = if keys.is_empty() { 0.0 } else { (sum / total) as f32 };
+            }
+        }
+    }
+    out
+}
+
+/// Sizes of a convolution window.
+#[derive(Clone, Copy, Debug)]
+pub struct Window {
+    /// Side of the square kernel.
+    pub kernel: usize,
+    /// Step between outputs.
+    pub stride: usize,
+    /// Zeros around the input.
+    pub pad: usize,
+}
+
+/// Convolution with zero padding: `weight` `[out, in, kernel, kernel]` -> `[oh, ow, out]`.
+pub fn conv2d(x: Hwc, weight: &[f32], bias: Option<&[f32]>, window: Window) -> Vec<f32> {
+    let Window { kernel, stride, pad } = window;
+    let per_out = x.c * kernel * kernel;
+    let n = weight.len() / per_out;
+    assert_eq!(weight.len(), n * per_out, "weights of {} channels, {kernel} x {kernel}", x.c);
+    let oh = crate::conv::conv_out(x.h, kernel, stride, pad);
+    let ow = crate::conv::conv_out(x.w, kernel, stride, pad);
+    let mut out = Vec::with_capacity(oh * ow * n);
+    for oy in 0..oh {
+        for ox in 0..ow {
+            for o in 0..n {
+                let mut sum = bias.map_or(0.0, |b| f64::from(b[o]));
+                for ky in 0..kernel {
+                    for kx in 0..kernel {
+                        // Row and column in the padded image.
+                        let (y, xx) = (oy * stride + ky, ox * stride + kx);
+                        if y < pad || xx < pad || y - pad >= x.h || xx - pad >= x.w {
+                            continue;
+                        }
+                        let pixel = x.pixel(y - pad, xx - pad);
+                        for (i, v) in pixel.iter().enumerate() {
+                            let w = weight[((o * x.c + i) * kernel + ky) * kernel + kx];
+                            sum += f64::from(*v) * f64::from(w);
+                        }
+                    }
+                }
+                out.push(sum as f32);
+            }
+        }
+    }
+    out
+}
+
+/// Transposed convolution with stride = kernel: `weight` `[in, out, kernel, kernel]` ->
+/// `[h * kernel, w * kernel, out]`.
+pub fn conv_transpose(x: Hwc, weight: &[f32], bias: Option<&[f32]>, kernel: usize) -> Vec<f32> {
+    let n = weight.len() / (x.c * kernel * kernel);
+    assert_eq!(weight.len(), n * x.c * kernel * kernel, "weights of {} channels, {kernel} x {kernel}", x.c);
+    let mut out = vec![0.0; x.h * x.w * kernel * kernel * n];
+    for oy in 0..x.h * kernel {
+        for ox in 0..x.w * kernel {
+            let pixel = x.pixel(oy / kernel, ox / kernel);
+            for o in 0..n {
+                let mut sum = bias.map_or(0.0, |b| f64::from(b[o]));
+                for (i, v) in pixel.iter().enumerate() {
+                    let w = weight[((i * n + o) * kernel + oy % kernel) * kernel + ox % kernel];
+                    sum += f64::from(*v) * f64::from(w);
+                }
+                out[(oy * x.w * kernel + ox) * n + o] = sum as f32;
+            }
+        }
+    }
+    out
+}
+
+/// Bilinear resize to `[h, w, c]`.
+///
+/// Source position of output i: `i (n-1)/(m-1)` with aligned corners (0 when m = 1), else
+/// `max(0, (i + 1/2) n/m - 1/2)`; positions are computed in f32 as PyTorch does, and the right or lower
+/// neighbour is clamped to the image.
+pub fn bilinear(x: Hwc, corners: Corners, h: usize, w: usize) -> Vec<f32> {
+    let mut out = Vec::with_capacity(h * w * x.c);
+    for oy in 0..h {
+        let (y0, y1, fy) = crate::resize::source(oy, x.h, h, corners);
+        for ox in 0..w {
+            let (x0, x1, fx) = crate::resize::source(ox, x.w, w, corners);
+            for ch in 0..x.c {
+                let at = |y: usize, xx: usize| f64::from(x.pixel(y, xx)[ch]);
+                let (fx, fy) = (f64::from(fx), f64::from(fy));
+                let top = at(y0, x0) * (1.0 - fx) + at(y0, x1) * fx;
+                let bottom = at(y1, x0) * (1.0 - fx) + at(y1, x1) * fx;
+                out.push((top * (1.0 - fy) + bottom * fy) as f32);
+            }
+        }
+    }
+    out
+}
+
+/// Column `ch * p * p + dy * p + dx` of patch (y, x) fills pixel (y p + dy, x p + dx) of channel ch:
+/// `x` `[ph * pw, c * p * p]` -> `[ph * p, pw * p, c]`.
+pub fn pixel_shuffle(x: Mat, grid: (usize, usize), p: usize) -> Vec<f32> {
+    let (ph, pw) = grid;
+    assert_eq!(x.rows, ph * pw, "{ph} x {pw} patches");
+    let c = x.cols / (p * p);
+    assert_eq!(x.cols, c * p * p, "{} columns for patches of {p} x {p}", x.cols);
+    let mut out = vec![0.0; x.rows * x.cols];
+    for oy in 0..ph * p {
+        for ox in 0..pw * p {
+            for ch in 0..c {
+                let from = x.row((oy / p) * pw + ox / p)[(ch * p + oy % p) * p + ox % p];
+                out[(oy * pw * p + ox) * c + ch] = from;
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn erf_known_values() {
+        // Abramowitz and Stegun, table 7.1, and erfc(4), erfc(6) to 12 digits.
+        for (x, y) in [(0.0, 0.0), (0.5, 0.520_499_877_813), (1.0, 0.842_700_792_950), (2.0, 0.995_322_265_019)] {
+            assert!((erf(x) - y).abs() < 1e-12, "erf({x})");
+            assert!((erf(-x) + y).abs() < 1e-12, "erf(-{x})");
+        }
+        assert!((erfc(4.0) / 1.541_725_790_03e-8 - 1.0).abs() < 1e-10);
+        assert!((erfc(6.0) / 2.151_973_671_25e-17 - 1.0).abs() < 1e-10);
+        assert!((erfc(3.0 - 1e-12) / erfc(3.0) - 1.0).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,2 @@
+//! Sixteen-lane vectors.
+pub mod table;
