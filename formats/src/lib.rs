@@ -21,6 +21,7 @@ pub mod atomic;
 pub mod camera;
 pub mod checkpoint;
 pub mod config;
+pub mod digest;
 pub mod error;
 mod json;
 mod safetensors_in;
