@@ -25,6 +25,7 @@ pub mod digest;
 pub mod error;
 mod json;
 mod safetensors_in;
+pub mod panel;
 pub mod scene;
 pub mod sniff;
 #[cfg(feature = "pytorch")]
