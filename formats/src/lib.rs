@@ -26,6 +26,7 @@ pub mod error;
 mod json;
 mod safetensors_in;
 pub mod panel;
+pub mod meta;
 pub mod scene;
 pub mod sniff;
 #[cfg(feature = "pytorch")]
