@@ -24,6 +24,7 @@ pub mod config;
 pub mod digest;
 pub mod error;
 mod json;
+mod map;
 mod safetensors_in;
 pub mod panel;
 pub mod meta;
