@@ -5,6 +5,14 @@
 //! | `error.rs` | [`Error`], [`Status`]: one line per fault, exit code = C API value |
 //! | `config.rs` | [`ModelConfig`]: every size and every convention of the network, presets |
 //! | `arch.rs` | the exact set of tensors a [`ModelConfig`] asks for |
+//! | `blob.rs` | [`Blob`]: the `.sfw` weight file, validated and used in place |
+//! | `blob_check.rs` | its validation, cheapest step first |
+//! | `blob_layout.rs` | every offset and limit of the format |
+//! | `blob_writer.rs` | [`BlobWriter`]: writes one, tensor by tensor |
+//! | `meta.rs` | [`Meta`]: typed metadata of a blob |
+//! | `panel.rs` | order of a matrix's weights in a blob |
+//! | `digest.rs` | SHA-256 |
+//! | `map.rs` | opening files safely; the one memory mapping |
 //! | `atomic.rs` | whole-or-nothing writing: temporary file, then rename |
 //! | `camera.rs` | [`Pose`], [`Intrinsics`], [`Camera`] |
 //! | `checkpoint.rs` | [`checkpoint::open`]: training checkpoints, read tensor by tensor |
@@ -18,6 +26,10 @@
 
 pub mod arch;
 pub mod atomic;
+pub mod blob;
+mod blob_check;
+pub mod blob_layout;
+pub mod blob_writer;
 pub mod camera;
 pub mod checkpoint;
 pub mod config;
@@ -25,15 +37,18 @@ pub mod digest;
 pub mod error;
 mod json;
 mod map;
-mod safetensors_in;
-pub mod panel;
 pub mod meta;
+pub mod panel;
+mod safetensors_in;
 pub mod scene;
 pub mod sniff;
 #[cfg(feature = "pytorch")]
 mod torch_in;
 
+pub use blob::{Blob, Dtype, Layout, LoadMode, TensorRecord, Verify};
+pub use blob_writer::BlobWriter;
 pub use camera::{Camera, Intrinsics, Pose};
 pub use config::ModelConfig;
 pub use error::{Error, Result, Status};
+pub use meta::Meta;
 pub use scene::{Gaussians, Scene};

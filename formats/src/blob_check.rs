@@ -1,0 +1,477 @@
+//! Validation of a `.sfw` file, cheapest step first; nothing is allocated before the header's digest
+//! matches, and nothing ever in proportion to a number the file merely states.
+//!
+//! Order: fixed header, exact file length, section bounds and caps, header digest, metadata, records
+//! (names, types, extents, padding), configuration, the set of tensors. Digests and values of the
+//! tensors follow in [`verify_tensors`], digest before value: a flipped bit is damage (status 9) even
+//! where it happens to make a NaN.
+
+use crate::arch::{self, TensorSpec};
+use crate::blob::TensorRecord;
+use crate::blob_layout::{self as layout, Dtype, Layout, header, record};
+use crate::config::{ModelConfig, Value};
+use crate::digest::{Digest, hex, sha256};
+use crate::error::{Error, Result, escape};
+use crate::meta::{self, Meta};
+use crate::panel::LANES;
+use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// What a valid file says.
+#[derive(Debug)]
+pub(crate) struct Parsed {
+    pub(crate) config: ModelConfig,
+    pub(crate) meta: Meta,
+    pub(crate) tensors: Vec<TensorRecord>,
+    pub(crate) digest: Digest,
+}
+
+/// Sections, as byte ranges; they tile the header section.
+struct Sections {
+    metadata: Range<usize>,
+    metadata_count: u64,
+    table: Range<usize>,
+    names: Range<usize>,
+    data: usize,
+}
+
+/// Checks the fixed header (`head`: the first 256 bytes, or all of a shorter file) against the length
+/// of the file.
+pub(crate) fn check_header(head: &[u8], file_bytes: u64, at: &str) -> Result<()> {
+    sections(head, file_bytes, at).map(|_| ())
+}
+
+fn sections(head: &[u8], file_bytes: u64, at: &str) -> Result<Sections> {
+    let bad = |why: String| Err(Error::model(at, why));
+    let unsupported = |why: String| Err(Error::unsupported(at, why));
+    if head.is_empty() {
+        return bad("the file is empty".into());
+    }
+    if !head.starts_with(&layout::MAGIC_BYTES[..head.len().min(8)]) {
+        return Err(Error::model(at, not_a_blob(head)));
+    }
+    let Some(h) = head.get(..layout::HEADER) else {
+        return bad(format!("cut off: the header needs {} bytes, the file has {file_bytes}", layout::HEADER));
+    };
+    let endian = header::ENDIAN.number(h) as u32;
+    if endian == layout::ENDIAN_WORD.swap_bytes() {
+        return unsupported("big-endian blob; only little-endian ones are read: convert the checkpoint again".into());
+    }
+    if endian != layout::ENDIAN_WORD {
+        return bad(format!("byte-order word is {endian:#010x}, must be {:#010x}", layout::ENDIAN_WORD));
+    }
+    let major = header::MAJOR.number(h);
+    if major != u64::from(layout::VERSION.0) {
+        return unsupported(format!(
+            "blob format version {major}.{}, this program reads {}.x: {}",
+            header::MINOR.number(h),
+            layout::VERSION.0,
+            if major > u64::from(layout::VERSION.0) { "use a newer program" } else { "convert the checkpoint again" },
+        ));
+    }
+    if header::HEADER_LENGTH.number(h) != layout::HEADER as u64 {
+        return bad(format!("header length {} must be {}", header::HEADER_LENGTH.number(h), layout::HEADER));
+    }
+    let architecture = header::ARCHITECTURE.number(h);
+    if architecture != u64::from(layout::ARCHITECTURE_STREETFORWARD) {
+        return unsupported(format!(
+            "architecture id {architecture}; known: {} (StreetForward)",
+            layout::ARCHITECTURE_STREETFORWARD
+        ));
+    }
+    let required = header::REQUIRED.number(h);
+    if required != 0 {
+        return unsupported(format!("required feature bits {required:#x} are unknown: use a newer program"));
+    }
+    let kind = header::DIGEST_KIND.number(h);
+    if kind != u64::from(layout::DIGEST_SHA256) {
+        return unsupported(format!("digest algorithm {kind}; known: {} (SHA-256)", layout::DIGEST_SHA256));
+    }
+    if header::RESERVED.of(h).iter().any(|&b| b != 0) {
+        return bad("reserved bytes of the header must be zero".into());
+    }
+    if file_bytes > layout::MAX_FILE {
+        return unsupported(format!("{file_bytes} bytes; the limit is {}", layout::MAX_FILE));
+    }
+    let stated = header::FILE_LENGTH.number(h);
+    if stated != file_bytes {
+        let what = if stated > file_bytes { "truncated: copy it again" } else { "extra bytes at the end" };
+        return bad(format!("the header says {stated} bytes, the file has {file_bytes}: {what}"));
+    }
+    if file_bytes < layout::MIN_FILE {
+        return bad(format!("{file_bytes} bytes; a blob has at least {}", layout::MIN_FILE));
+    }
+
+    let count = header::TENSOR_COUNT.number(h);
+    if count == 0 || count > layout::MAX_TENSORS {
+        return bad(format!("{count} tensors; must be 1..{}", layout::MAX_TENSORS));
+    }
+    let mut end = layout::HEADER as u64;
+    let mut section = |name: &str, offset: u64, length: u64| {
+        if offset != end {
+            return Err(Error::model(at, format!("{name} start at {offset}, must be {end}")));
+        }
+        end = offset
+            .checked_add(length)
+            .filter(|&e| e <= layout::MAX_HEAD.min(file_bytes))
+            .ok_or_else(|| Error::model(at, format!("{name} of {length} bytes do not fit into the header section")))?;
+        Ok(offset as usize..end as usize)
+    };
+    let metadata = section("metadata", header::META_OFFSET.number(h), header::META_LENGTH.number(h))?;
+    let table = section("records", header::TABLE_OFFSET.number(h), header::TABLE_LENGTH.number(h))?;
+    let names = section("names", header::NAMES_OFFSET.number(h), header::NAMES_LENGTH.number(h))?;
+    if table.len() as u64 != count * layout::RECORD as u64 {
+        return bad(format!("{} bytes of records for {count} tensors of {} each", table.len(), layout::RECORD));
+    }
+    let data = header::DATA_OFFSET.number(h);
+    let want = names.end.next_multiple_of(layout::DATA_ALIGN as usize) as u64;
+    if data != want || data > layout::MAX_HEAD {
+        return bad(format!("data start at {data}, must be {want} and at most {}", layout::MAX_HEAD));
+    }
+    if data.checked_add(header::DATA_LENGTH.number(h)) != Some(file_bytes) || data == file_bytes {
+        return bad(format!(
+            "data of {} bytes at {data} must end with the file at {file_bytes}",
+            header::DATA_LENGTH.number(h)
+        ));
+    }
+    Ok(Sections { metadata, metadata_count: header::META_COUNT.number(h), table, names, data: data as usize })
+}
+
+/// Checks the structure of a whole file.
+pub(crate) fn parse(bytes: &[u8], at: &str) -> Result<Parsed> {
+    let s = sections(&bytes[..bytes.len().min(layout::HEADER)], bytes.len() as u64, at)?;
+    let head = &bytes[..s.data];
+    let digest = check_digests(head, &s, at)?;
+    check_zeros(bytes, s.names.end..s.data, at)?;
+
+    let pairs = meta::decode(&head[s.metadata.clone()], s.metadata_count, at)?;
+    let records = records(bytes, &s, at)?;
+    let mut settings: BTreeMap<String, Value> = BTreeMap::new();
+    let mut meta = Meta::new();
+    for (key, value) in pairs {
+        match key.strip_prefix(meta::CONFIG_PREFIX) {
+            Some(setting) => {
+                settings.insert(setting.to_string(), value);
+            }
+            None => meta.set(&key, value),
+        }
+    }
+    let config = ModelConfig::from_pairs(ModelConfig::base(), &settings, true, at)?;
+    config.check(at)?;
+    let tensors = match_specs(records, arch::tensors(&config), at)?;
+    Ok(Parsed { config, meta, tensors, digest })
+}
+
+/// Header digest, then the root over the tensors' digests.
+fn check_digests(head: &[u8], s: &Sections, at: &str) -> Result<Digest> {
+    let f = header::HEADER_DIGEST;
+    let mut hash = Sha256::new();
+    hash.update(&head[..f.offset]);
+    hash.update([0; 32]);
+    hash.update(&head[f.offset + f.size..]);
+    let digest: Digest = hash.finalize().into();
+    if digest[..] != *f.of(head) {
+        return Err(Error::integrity(
+            at,
+            "the digest of the header does not match: the file is damaged, copy it again",
+        ));
+    }
+    let mut root = Sha256::new();
+    for row in head[s.table.clone()].chunks_exact(layout::RECORD) {
+        root.update(record::DIGEST.of(row));
+    }
+    if root.finalize()[..] != *header::TENSOR_ROOT.of(head) {
+        return Err(Error::integrity(at, "the root of the tensors' digests does not match the records"));
+    }
+    Ok(digest)
+}
+
+fn check_zeros(bytes: &[u8], range: Range<usize>, at: &str) -> Result<()> {
+    match bytes[range.clone()].iter().position(|&b| b != 0) {
+        Some(i) => Err(Error::model(at, format!("padding at byte {} is not zero", range.start + i))),
+        None => Ok(()),
+    }
+}
+
+struct Record<'a> {
+    name: &'a str,
+    shape: Vec<usize>,
+    dtype: Dtype,
+    layout: Layout,
+    offset: usize,
+    bytes: usize,
+    digest: Digest,
+}
+
+/// Reads the records; extents, padding and names are valid and unique afterwards.
+fn records<'a>(bytes: &'a [u8], s: &Sections, at: &str) -> Result<Vec<Record<'a>>> {
+    let names = &bytes[s.names.clone()];
+    let mut name_end = 0usize;
+    let mut end = s.data as u64;
+    let mut list = Vec::new();
+    for (i, row) in bytes[s.table.clone()].chunks_exact(layout::RECORD).enumerate() {
+        let length = record::NAME_LENGTH.number(row) as usize;
+        if record::NAME_OFFSET.number(row) != name_end as u64 || length == 0 || length > layout::MAX_NAME {
+            return Err(Error::model(
+                at,
+                format!("record {i}: its name must follow the one before and have 1..{} bytes", layout::MAX_NAME),
+            ));
+        }
+        let Some(name) = names.get(name_end..name_end + length) else {
+            return Err(Error::model(at, format!("record {i}: its name runs past the names section")));
+        };
+        name_end += length;
+        let r = extent(row, name, (end, bytes.len() as u64), at)?;
+        check_zeros(bytes, end as usize..r.offset, at)?;
+        end = (r.offset + r.bytes) as u64;
+        list.push(r);
+    }
+    if name_end != names.len() {
+        return Err(Error::model(at, format!("{} bytes follow the last name", names.len() - name_end)));
+    }
+    if end != bytes.len() as u64 {
+        return Err(Error::model(at, format!("{} bytes follow the last tensor", bytes.len() as u64 - end)));
+    }
+    let mut folded: Vec<String> = list.iter().map(|r| r.name.to_ascii_lowercase()).collect();
+    folded.sort_unstable();
+    if let Some(pair) = folded.windows(2).find(|pair| pair[0] == pair[1]) {
+        return Err(Error::model(at, format!("two tensors are called {} (case aside)", pair[0])));
+    }
+    Ok(list)
+}
+
+/// One record; `(end, file)`: where the tensor before ends, and the file.
+fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> Result<Record<'a>> {
+    let shown = format!("{at}: tensor {}", escape(name));
+    let bad = |why: String| Err(Error::model(&shown, why));
+    let allowed = |b: &u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-');
+    let name = match std::str::from_utf8(name) {
+        Ok(n) if name.iter().all(allowed) => n,
+        _ => return bad("names consist of letters, digits, '.', '_' and '-'".into()),
+    };
+    let (code, order) = (record::DTYPE.number(row) as u8, record::LAYOUT.number(row) as u8);
+    let (Some(dtype), Some(order)) = (Dtype::from_code(code), Layout::from_code(order)) else {
+        let known = if code == layout::DTYPE_S8 || order == layout::LAYOUT_K4N16 { "reserved" } else { "unknown" };
+        return Err(Error::unsupported(
+            shown,
+            format!("type {code}, layout {order} is {known}; this program reads f32 and f16, row-major and K1N16"),
+        ));
+    };
+    if record::RESERVED.of(row).iter().any(|&b| b != 0) {
+        return bad("reserved bytes of the record must be zero".into());
+    }
+    let rank = record::RANK.number(row) as usize;
+    if rank == 0 || rank > layout::MAX_RANK {
+        return bad(format!("{rank} dimensions; must be 1..{}", layout::MAX_RANK));
+    }
+    let dims: Vec<u32> =
+        record::DIMS.of(row).chunks_exact(4).map(|d| u32::from_le_bytes([d[0], d[1], d[2], d[3]])).collect();
+    if dims[..rank].iter().any(|&d| d == 0 || d > layout::MAX_DIM) || dims[rank..].iter().any(|&d| d != 0) {
+        return bad(format!("dimensions {dims:?} of which {rank} count must be 1..{}, the others 0", layout::MAX_DIM));
+    }
+    let (offset, length) = (record::OFFSET.number(row), record::LENGTH.number(row));
+    let stop = offset.checked_add(length).filter(|&e| e <= file);
+    if stop.is_none() {
+        return bad(format!("{length} bytes at {offset} run past the end of the file at {file}"));
+    }
+    let values = dims[..rank].iter().try_fold(dtype.size() as u64, |n, &d| n.checked_mul(u64::from(d)));
+    if values.is_none_or(|v| v > length) {
+        return bad(format!("shape {:?} of {} does not fit into {length} bytes", &dims[..rank], dtype.name()));
+    }
+    let want = layout::align(end, layout::TENSOR_ALIGN).unwrap_or(u64::MAX);
+    if offset != want {
+        let what = match offset {
+            o if o % layout::TENSOR_ALIGN != 0 => "not a multiple of 64",
+            o if o < want => "overlap with the tensor before",
+            _ => "gap after the tensor before",
+        };
+        return bad(format!("starts at {offset}, must be {want}: {what}"));
+    }
+    let mut digest = [0; 32];
+    digest.copy_from_slice(record::DIGEST.of(row));
+    let shape = dims[..rank].iter().map(|&d| d as usize).collect();
+    Ok(Record { name, shape, dtype, layout: order, offset: offset as usize, bytes: length as usize, digest })
+}
+
+/// Pairs the records with what the network needs: nothing missing, nothing extra, every shape equal,
+/// and each tensor stored the one way its role has.
+fn match_specs(records: Vec<Record>, specs: Vec<TensorSpec>, at: &str) -> Result<Vec<TensorRecord>> {
+    let mut wanted: BTreeMap<String, TensorSpec> = specs.into_iter().map(|s| (s.name.clone(), s)).collect();
+    let (mut tensors, mut extra, mut shapes) = (Vec::new(), Vec::new(), Vec::new());
+    for r in records {
+        match wanted.remove(r.name) {
+            None => extra.push(r.name.to_string()),
+            Some(spec) if spec.shape != r.shape => {
+                shapes.push(format!("{} is {:?}, must be {:?}", r.name, r.shape, spec.shape));
+            }
+            Some(spec) => tensors.push(TensorRecord {
+                spec,
+                dtype: r.dtype,
+                layout: r.layout,
+                offset: r.offset,
+                bytes: r.bytes,
+                digest: r.digest,
+            }),
+        }
+    }
+    let missing: Vec<String> = wanted.into_keys().collect();
+    let mut faults = Vec::new();
+    for (what, list) in [("missing", missing), ("not expected", extra), ("of another shape", shapes)] {
+        if !list.is_empty() {
+            let dots = if list.len() > 5 { ", ..." } else { "" };
+            faults.push(format!("{} {what}: {}{dots}", list.len(), list[..list.len().min(5)].join(", ")));
+        }
+    }
+    if !faults.is_empty() {
+        return Err(Error::model(at, format!("tensors do not match the configuration: {}", faults.join("; "))));
+    }
+    for t in &tensors {
+        let (order, values) = match t.spec.matrix() {
+            Some((n, k)) => (Layout::K1N16, n.checked_next_multiple_of(LANES).and_then(|n| n.checked_mul(k))),
+            None => (Layout::RowMajor, Some(t.spec.len())),
+        };
+        let shown = || format!("{at}: tensor {}", t.spec.name);
+        if t.layout != order || (order == Layout::RowMajor && t.dtype != Dtype::F32) {
+            return Err(Error::model(
+                shown(),
+                format!(
+                    "stored as {} {}; matrices are K1N16, vectors and tables RowMajor f32",
+                    t.layout.name(),
+                    t.dtype.name()
+                ),
+            ));
+        }
+        if values.and_then(|v| v.checked_mul(t.dtype.size())) != Some(t.bytes) {
+            return Err(Error::model(
+                shown(),
+                format!("shape {:?} as {} {} is not {} bytes", t.spec.shape, t.layout.name(), t.dtype.name(), t.bytes),
+            ));
+        }
+    }
+    Ok(tensors)
+}
+
+/// Digest, then values of every tensor, on two threads when that pays; the first fault in file order.
+pub(crate) fn verify_tensors(bytes: &[u8], tensors: &[TensorRecord], at: &str) -> Result<()> {
+    let next = AtomicUsize::new(0);
+    let work = || {
+        loop {
+            // Faults are rare: each worker keeps its first, and the smaller index wins below.
+            let i = next.fetch_add(1, Ordering::Relaxed);
+            let Some(t) = tensors.get(i) else { return Ok(()) };
+            verify_tensor(&bytes[t.offset..t.offset + t.bytes], t, at).map_err(|e| (i, e))?;
+        }
+    };
+    // Starting a thread costs as much as hashing some 100 KiB.
+    if bytes.len() < 1 << 20 {
+        return work().map_err(|(_, e)| e);
+    }
+    let both = std::thread::scope(|s| {
+        let other = s.spawn(work);
+        let mine = work();
+        [mine, other.join().unwrap_or_else(|p| std::panic::resume_unwind(p))]
+    });
+    both.into_iter().filter_map(Result::err).min_by_key(|(i, _)| *i).map_or(Ok(()), |(_, e)| Err(e))
+}
+
+fn verify_tensor(bytes: &[u8], t: &TensorRecord, at: &str) -> Result<()> {
+    let found = sha256(bytes);
+    let shown = || format!("{at}: tensor {}", t.spec.name);
+    if found != t.digest {
+        return Err(Error::integrity(
+            shown(),
+            format!(
+                "SHA-256 is {}..., recorded {}...: the file is damaged, copy it again",
+                &hex(&found)[..16],
+                &hex(&t.digest)[..16]
+            ),
+        ));
+    }
+    // Exponent bits all set: NaN or infinite. Folded without a branch, so it runs at memory speed.
+    let finite = match t.dtype {
+        Dtype::F32 => bytes
+            .chunks_exact(4)
+            .all_folded(|v| u32::from_le_bytes([v[0], v[1], v[2], v[3]]) & 0x7f80_0000 != 0x7f80_0000),
+        Dtype::F16 => bytes.chunks_exact(2).all_folded(|v| u16::from_le_bytes([v[0], v[1]]) & 0x7c00 != 0x7c00),
+    };
+    if !finite {
+        let size = t.dtype.size();
+        let first = bytes.chunks_exact(size).position(|v| match t.dtype {
+            Dtype::F32 => u32::from_le_bytes([v[0], v[1], v[2], v[3]]) & 0x7f80_0000 == 0x7f80_0000,
+            Dtype::F16 => u16::from_le_bytes([v[0], v[1]]) & 0x7c00 == 0x7c00,
+        });
+        return Err(Error::model(shown(), format!("value {} is NaN or infinite", first.unwrap_or(0))));
+    }
+    if let Some((n, k)) = t.spec.matrix().filter(|(n, _)| n % LANES != 0) {
+        let line = LANES * t.dtype.size();
+        let last = &bytes[bytes.len() - k * line..];
+        if last.chunks_exact(line).any(|l| l[n % LANES * t.dtype.size()..].iter().any(|&b| b != 0)) {
+            return Err(Error::model(
+                shown(),
+                format!("the unused outputs of its last panel ({n} outputs) are not zero"),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// `all` without early exit, in a form the compiler turns into vector code.
+trait AllFolded: Iterator + Sized {
+    fn all_folded(self, test: impl Fn(Self::Item) -> bool) -> bool {
+        self.fold(true, |ok, v| ok & test(v))
+    }
+}
+
+impl<I: Iterator> AllFolded for I {}
+
+/// What a file without our magic is, and what to do with it.
+fn not_a_blob(head: &[u8]) -> String {
+    let m = layout::MAGIC_BYTES;
+    let text_damage = "a blob damaged by a text-mode transfer: copy it again in binary mode";
+    let convert = "run `streetforward convert` on it";
+    // Length of a safetensors header, then its opening brace.
+    let safetensors = head.len() > 8 && head[8] == b'{' && head[4..8] == [0; 4];
+    let known: &[(&[u8], &str)] = &[
+        (
+            &[0xef, 0xbb, 0xbf, 0x89, b'S', b'F', b'W'],
+            "a blob with a byte-order mark put in front: copy it again in binary mode",
+        ),
+        (
+            &[0xef, 0xbb, 0xbf, 0xc2, 0x89, b'S', b'F', b'W'],
+            "a blob re-encoded as UTF-8 text: copy it again in binary mode",
+        ),
+        (&[0xc2, 0x89, b'S', b'F', b'W'], "a blob re-encoded as UTF-8 text: copy it again in binary mode"),
+        (&[0xef, 0xbf, 0xbd, b'S', b'F', b'W'], "a blob re-encoded as UTF-8 text: copy it again in binary mode"),
+        (&[0x09, b'S', b'F', b'W'], "a blob whose high bits were stripped: copy it again in binary mode"),
+        (&m[..4], text_damage),
+        (b"GGUF", "a GGUF model; StreetForward needs its own checkpoint: see `streetforward convert --help`"),
+        (b"PK\x03\x04", "a zip archive, perhaps a PyTorch checkpoint (.pt): run `streetforward convert` on it"),
+        (b"\x80\x02", "a Python pickle, perhaps an old PyTorch checkpoint: run `streetforward convert` on it"),
+        (b"\x7fELF", "an ELF program or library, not a model"),
+        (b"MZ", "a Windows program, not a model"),
+        (b"\x08\x03\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x04\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x05\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x06\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x07\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x08\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x09\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x08\x0a\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
+        (b"\x89PNG", "a PNG image, not a model"),
+        (b"\xff\xd8\xff", "a JPEG image, not a model"),
+        (b"\x89HDF", "an HDF5 file, not a blob"),
+        (b"version https://git-lfs", "a Git LFS pointer: fetch the file itself with `git lfs pull`"),
+        (b"ply\n", "a PLY point cloud or splat scene, not a model"),
+        (b"\x1f\x8b", "a gzip archive: unpack it first"),
+        (b"{", "JSON, not a blob"),
+    ];
+    if safetensors {
+        return format!("not a blob but a safetensors checkpoint: {convert}");
+    }
+    match known.iter().find(|(magic, _)| head.starts_with(magic)) {
+        Some((_, what)) => format!("not a blob but {what}").replace("not a blob but a blob", "a blob"),
+        None => format!("not a blob: it starts with {}", escape(&head[..head.len().min(8)])),
+    }
+}
