@@ -17,6 +17,8 @@
 //! | `camera.rs` | [`Pose`], [`Intrinsics`], [`Camera`] |
 //! | `checkpoint.rs` | [`checkpoint::open`]: training checkpoints, read tensor by tensor |
 //! | `safetensors_in.rs`, `torch_in.rs` | the two checkpoint formats |
+//! | `clip.rs`, `truth.rs`, `transforms.rs` | [`clip::Clip`]: frames, times, reference poses, ground truth |
+//! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
 //! | `sniff.rs`, `json.rs` | what a file is by its content; JSON without equal keys |
 //! | `scene.rs` | [`Scene`]: moving Gaussians; the composition at any time |
 //!
@@ -32,18 +34,23 @@ pub mod blob_layout;
 pub mod blob_writer;
 pub mod camera;
 pub mod checkpoint;
+pub mod clip;
 pub mod config;
 pub mod digest;
 pub mod error;
+pub mod image_io;
 mod json;
 mod map;
 pub mod meta;
+pub mod npy;
 pub mod panel;
 mod safetensors_in;
 pub mod scene;
 pub mod sniff;
 #[cfg(feature = "pytorch")]
 mod torch_in;
+pub mod transforms;
+mod truth;
 
 pub use blob::{Blob, Dtype, Layout, LoadMode, TensorRecord, Verify};
 pub use blob_writer::BlobWriter;
