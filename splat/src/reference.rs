@@ -105,7 +105,8 @@ fn project(scene: &Gaussians, i: usize, camera: &Camera, settings: &SplatSetting
 fn pixel(splats: &[Splat], centre: DVec2, a_max: f64, background: [f32; 3], image: &mut ReferenceImage) {
     let (mut t, mut depth, mut slack) = (1.0, 0.0, 0.0);
     let mut rgb = [0.0; 3];
-    // Depth and alpha of the last Gaussian that took part.
+    // Depth and alpha of the last Gaussian that took part. Equal depths are no matter of rounding:
+    // both sides order them by index.
     let mut last = (f64::NEG_INFINITY, 0.0);
     for s in splats {
         let d = centre - s.mean;
@@ -117,7 +118,7 @@ fn pixel(splats: &[Splat], centre: DVec2, a_max: f64, background: [f32; 3], imag
             continue;
         }
         let alpha = raw.min(a_max);
-        if s.z - last.0 <= DEPTH_SLACK * s.z {
+        if s.z > last.0 && s.z - last.0 <= DEPTH_SLACK * s.z {
             slack += t * alpha * last.1;
         }
         last = (s.z, alpha);
