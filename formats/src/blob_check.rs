@@ -14,6 +14,7 @@ use crate::digest::{Digest, hex, sha256};
 use crate::error::{Error, Result, escape};
 use crate::meta::{self, Meta};
 use crate::panel::LANES;
+use crate::sniff::FileKind;
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -244,10 +245,10 @@ fn records<'a>(bytes: &'a [u8], s: &Sections, at: &str) -> Result<Vec<Record<'a>
 
 /// One record; `(end, file)`: where the tensor before ends, and the file.
 fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> Result<Record<'a>> {
-    let shown = format!("{at}: tensor {}", escape(name));
-    let bad = |why: String| Err(Error::model(&shown, why));
+    let shown = || format!("{at}: tensor {}", escape(name));
+    let bad = |why: String| Err(Error::model(shown(), why));
     let allowed = |b: &u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-');
-    let name = match std::str::from_utf8(name) {
+    let text = match std::str::from_utf8(name) {
         Ok(n) if name.iter().all(allowed) => n,
         _ => return bad("names consist of letters, digits, '.', '_' and '-'".into()),
     };
@@ -255,7 +256,7 @@ fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> 
     let (Some(dtype), Some(order)) = (Dtype::from_code(code), Layout::from_code(order)) else {
         let known = if code == layout::DTYPE_S8 || order == layout::LAYOUT_K4N16 { "reserved" } else { "unknown" };
         return Err(Error::unsupported(
-            shown,
+            shown(),
             format!("type {code}, layout {order} is {known}; this program reads f32 and f16, row-major and K1N16"),
         ));
     };
@@ -277,8 +278,10 @@ fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> 
         return bad(format!("{length} bytes at {offset} run past the end of the file at {file}"));
     }
     let values = dims[..rank].iter().try_fold(dtype.size() as u64, |n, &d| n.checked_mul(u64::from(d)));
-    if values.is_none_or(|v| v > length) {
-        return bad(format!("shape {:?} of {} does not fit into {length} bytes", &dims[..rank], dtype.name()));
+    // Panels are filled up to 16 outputs; their exact length is checked where the role is known.
+    let fits = values.is_some_and(|v| if order == Layout::RowMajor { v == length } else { v <= length });
+    if !fits {
+        return bad(format!("shape {:?} of {} is not {length} bytes", &dims[..rank], dtype.name()));
     }
     let want = layout::align(end, layout::TENSOR_ALIGN).unwrap_or(u64::MAX);
     if offset != want {
@@ -292,7 +295,7 @@ fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> 
     let mut digest = [0; 32];
     digest.copy_from_slice(record::DIGEST.of(row));
     let shape = dims[..rank].iter().map(|&d| d as usize).collect();
-    Ok(Record { name, shape, dtype, layout: order, offset: offset as usize, bytes: length as usize, digest })
+    Ok(Record { name: text, shape, dtype, layout: order, offset: offset as usize, bytes: length as usize, digest })
 }
 
 /// Pairs the records with what the network needs: nothing missing, nothing extra, every shape equal,
@@ -428,50 +431,31 @@ impl<I: Iterator> AllFolded for I {}
 
 /// What a file without our magic is, and what to do with it.
 fn not_a_blob(head: &[u8]) -> String {
-    let m = layout::MAGIC_BYTES;
-    let text_damage = "a blob damaged by a text-mode transfer: copy it again in binary mode";
-    let convert = "run `streetforward convert` on it";
-    // Length of a safetensors header, then its opening brace.
-    let safetensors = head.len() > 8 && head[8] == b'{' && head[4..8] == [0; 4];
-    let known: &[(&[u8], &str)] = &[
-        (
-            &[0xef, 0xbb, 0xbf, 0x89, b'S', b'F', b'W'],
-            "a blob with a byte-order mark put in front: copy it again in binary mode",
-        ),
-        (
-            &[0xef, 0xbb, 0xbf, 0xc2, 0x89, b'S', b'F', b'W'],
-            "a blob re-encoded as UTF-8 text: copy it again in binary mode",
-        ),
-        (&[0xc2, 0x89, b'S', b'F', b'W'], "a blob re-encoded as UTF-8 text: copy it again in binary mode"),
-        (&[0xef, 0xbf, 0xbd, b'S', b'F', b'W'], "a blob re-encoded as UTF-8 text: copy it again in binary mode"),
-        (&[0x09, b'S', b'F', b'W'], "a blob whose high bits were stripped: copy it again in binary mode"),
-        (&m[..4], text_damage),
-        (b"GGUF", "a GGUF model; StreetForward needs its own checkpoint: see `streetforward convert --help`"),
-        (b"PK\x03\x04", "a zip archive, perhaps a PyTorch checkpoint (.pt): run `streetforward convert` on it"),
-        (b"\x80\x02", "a Python pickle, perhaps an old PyTorch checkpoint: run `streetforward convert` on it"),
-        (b"\x7fELF", "an ELF program or library, not a model"),
-        (b"MZ", "a Windows program, not a model"),
-        (b"\x08\x03\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x04\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x05\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x06\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x07\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x08\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x09\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x08\x0a\x12", "an ONNX model; convert the checkpoint it was exported from with `streetforward convert`"),
-        (b"\x89PNG", "a PNG image, not a model"),
-        (b"\xff\xd8\xff", "a JPEG image, not a model"),
-        (b"\x89HDF", "an HDF5 file, not a blob"),
-        (b"version https://git-lfs", "a Git LFS pointer: fetch the file itself with `git lfs pull`"),
-        (b"ply\n", "a PLY point cloud or splat scene, not a model"),
-        (b"\x1f\x8b", "a gzip archive: unpack it first"),
-        (b"{", "JSON, not a blob"),
+    let utf8: &[&[u8]] = &[
+        &[0xc2, 0x89, b'S', b'F', b'W'],
+        &[0xef, 0xbf, 0xbd, b'S', b'F', b'W'],
+        &[0xef, 0xbb, 0xbf, 0xc2, 0x89, b'S', b'F', b'W'],
     ];
-    if safetensors {
-        return format!("not a blob but a safetensors checkpoint: {convert}");
-    }
-    match known.iter().find(|(magic, _)| head.starts_with(magic)) {
-        Some((_, what)) => format!("not a blob but {what}").replace("not a blob but a blob", "a blob"),
-        None => format!("not a blob: it starts with {}", escape(&head[..head.len().min(8)])),
-    }
+    let damage = if head.starts_with(&[0xef, 0xbb, 0xbf, 0x89, b'S', b'F', b'W']) {
+        "a byte-order mark was put in front of it"
+    } else if utf8.iter().any(|u| head.starts_with(u)) {
+        "it was re-encoded as UTF-8 text"
+    } else if head.starts_with(&[0x09, b'S', b'F', b'W']) {
+        "its high bits were stripped"
+    } else if head.starts_with(&layout::MAGIC_BYTES[..4]) {
+        "its line ends were changed as if it were text"
+    } else {
+        let kind = FileKind::of_bytes(head);
+        let run = match kind {
+            FileKind::Safetensors | FileKind::Zip | FileKind::Pickle | FileKind::Tar => {
+                "; run `streetforward convert` on it"
+            }
+            FileKind::Unknown => {
+                return format!("not a weight blob: it starts with {}", escape(&head[..head.len().min(8)]));
+            }
+            _ => "",
+        };
+        return format!("not a weight blob: {}{run}", kind.advice());
+    };
+    format!("a damaged weight blob: {damage}; copy it again in binary mode")
 }
