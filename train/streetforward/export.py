@@ -60,6 +60,8 @@ def golden_case(case):
     broken = [name for name, tensor in exact.items() if not tensor.isfinite().all()]
     if broken or worst > F32_LIMIT:
         raise SystemExit(f"{case.name}: {worst_name} differs by {worst:.1e} in f32, not finite: {broken}")
+    if (exact["k"] <= 0).any():
+        raise SystemExit(f"{case.name}: no camera has the focal lengths {exact['k'][:, :2].tolist()}")
     inputs = {"in.images": torch.from_numpy(case.images()), "in.times": torch.from_numpy(case.times())}
     return weights | inputs | exact, {cfg.METADATA_KEY: cfg.to_json(config)}, f"{worst:.1e} at {worst_name}"
 

@@ -9,7 +9,7 @@ from .blocks import Block, Rope, patch_positions
 
 
 class Decoder(nn.Module):
-    """Frame-local decoder: `projects`, blocks with rotary positions but neither q/k norm nor layer scale, `linear_out`."""
+    """Frame-local decoder: `projects`, rotary blocks without q/k norm and layer scale, `linear_out`."""
 
     def __init__(self, inp, dim, depth, heads, out, eps):
         super().__init__()

@@ -55,7 +55,8 @@ class StreetForward(nn.Module):
         config = self.config
         frames, height, width, _ = images.shape
         if frames < 1 or height % config["patch"] or width % config["patch"]:
-            raise ValueError(f"{frames} frames of {width}x{height}: need one or more, sides multiples of {config['patch']}")
+            size = f"{frames} frames of {width}x{height}"
+            raise ValueError(f"{size}: need one or more, sides multiples of {config['patch']}")
         if len(times) != frames:
             raise ValueError(f"{len(times)} times for {frames} frames")
         grid = height // config["patch"], width // config["patch"]

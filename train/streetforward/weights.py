@@ -81,9 +81,10 @@ def golden_model(config, seed):
             p.copy_(x)
         point_bias(model, config)
         edge_bias(model, config)
-        # A reflection with well separated singular values: the projection has to undo it.
-        rotation = [[1.0, 0.1, 0.0], [0.6, 0.8, 0.1], [0.3, 0.2, -0.5]] if seed % 2 else [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-        model.camera_head.fc_rot.bias.add_(torch.tensor(rotation).flatten())
+        rotation = torch.eye(3)
+        if seed % 2:  # a reflection with well separated singular values: the projection has to undo it
+            rotation = torch.tensor([[1.0, 0.1, 0.0], [0.6, 0.8, 0.1], [0.3, 0.2, -0.5]])
+        model.camera_head.fc_rot.bias.add_(rotation.flatten())
         if config["camera.k"] == "fov":
             model.camera_head.fc_fov.bias.add_(torch.tensor([-0.1, 0.2]))
     return model
@@ -95,20 +96,24 @@ def point_bias(model, config):
     if config["depth.kind"] == "dpt":
         model.point_head.scratch.output_conv2[2].bias[-1] += 1.2
         return
-    bias = model.point_head.proj.bias.view(-1, patch, patch)
+    proj = model.point_head.proj
+    bias, weight = proj.bias.view(-1, patch, patch), proj.weight.view(-1, patch, patch, proj.in_features)
     bias[-1] += 1.2
     if len(bias) == 3:
+        bias[:2] *= 0.3
+        weight[:2] *= 0.3
         ramp = (torch.arange(patch) + 0.5) / patch - 0.5
-        bias[0] += 0.8 * ramp
-        bias[1] += 0.8 * ramp[:, None]
+        bias[0] += 0.6 * ramp
+        bias[1] += 0.6 * ramp[:, None]
 
 
 def edge_bias(model, config):
-    """Reaches both ends of the Gaussian scale's clamp, and the confidence cut where confidence decides."""
+    """Reaches both ends of the Gaussian scale's clamp and, where confidence decides, both sides of its cut at -2.2."""
     patch = config["patch"]
     if config["gs.kind"] == "xdec_linear":
         bias = model.gs_head.proj.bias.view(-1, patch, patch)
         bias[4, 0, 0] += 5
         bias[6, 1, 0] -= 5
     if config["gs.kind"] == "none" and config["conf.kind"] == "xdec_linear":
-        model.conf_head.proj.bias -= 2.2
+        model.conf_head.proj.bias[0::2] += 0.8
+        model.conf_head.proj.bias[1::2] -= 5.2
