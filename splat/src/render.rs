@@ -3,10 +3,11 @@
 //! Three parallel steps with a barrier each: project (16 runs of the scene), bin (the same runs), blend
 //! (tiles). A tile is owned by one thread and written to the image by it.
 
-use std::sync::{Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
 use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
+use sf_ops::par::Pool;
 
 use crate::bin::{self, GROUPS, Group};
 use crate::blend::{Channels, Place, Tile};
@@ -131,20 +132,29 @@ pub fn render(
 /// Draws images, keeping memory between them.
 #[derive(Debug)]
 pub struct Renderer {
-    threads: usize,
+    pool: Arc<Pool>,
     groups: [RwLock<Group>; GROUPS],
     tiles: Vec<Mutex<Tile>>,
 }
 
 impl Renderer {
-    /// A renderer with its own threads, at least one.
+    /// A renderer with its own threads, at least one (the caller).
+    ///
+    /// # Errors
+    /// Status 5 when the system refuses a thread.
     pub fn new(threads: usize) -> Result<Renderer> {
-        let threads = threads.max(1);
-        Ok(Renderer {
-            threads,
+        let pool = Pool::new(threads.max(1))
+            .map_err(|e| Error::resource("render", format!("cannot start {threads} threads: {e}")))?;
+        Ok(Renderer::with_pool(Arc::new(pool)))
+    }
+
+    /// A renderer on threads that others use too.
+    pub fn with_pool(pool: Arc<Pool>) -> Renderer {
+        Renderer {
             groups: std::array::from_fn(|_| RwLock::default()),
-            tiles: (0..threads).map(|_| Mutex::default()).collect(),
-        })
+            tiles: (0..pool.threads()).map(|_| Mutex::default()).collect(),
+            pool,
+        }
     }
 
     /// Draws an image.
@@ -197,7 +207,7 @@ impl Renderer {
         out.resize(camera.width as usize, camera.height as usize, extra.channels)?;
         out.stats = stats;
         let groups = &self.groups;
-        parallel(self.threads, GROUPS, &|g, _| write(&groups[g]).bin(g, (columns, rows)));
+        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(g, (columns, rows)));
         self.blend((columns, rows), (settings.a_max, options.background), extra, out);
         Ok(())
     }
@@ -206,7 +216,7 @@ impl Renderer {
     fn project(&mut self, scene: &Gaussians, projector: &Projector, extra: Channels) -> Stats {
         let usable = |i: usize| extra.values[i * extra.channels..][..extra.channels].iter().all(|v| v.is_finite());
         let groups = &self.groups;
-        parallel(self.threads, GROUPS, &|g, _| {
+        self.pool.run(GROUPS, &|g, _| {
             write(&groups[g]).project(projector, scene, bin::run(scene.len(), g), &usable);
         });
         let mut counts = Counts::default();
@@ -250,7 +260,7 @@ impl Renderer {
                 Mutex::new(Band { rgb, depth, alpha, extra: extra_bands.next().unwrap_or_default() })
             })
             .collect();
-        parallel(self.threads, (columns * rows) as usize, &|t, worker| {
+        self.pool.run((columns * rows) as usize, &|t, worker| {
             let groups: [RwLockReadGuard<Group>; GROUPS] = std::array::from_fn(|g| read(&self.groups[g]));
             let mut tile = lock(&self.tiles[worker]);
             let (tx, ty) = (t % columns as usize, t / columns as usize);
@@ -338,24 +348,4 @@ fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Runs `f(task, worker)` for every task, tasks taken from a counter.
-fn parallel(threads: usize, tasks: usize, f: &(dyn Fn(usize, usize) + Sync)) {
-    let next = std::sync::atomic::AtomicUsize::new(0);
-    let work = |worker: usize| {
-        loop {
-            let task = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-            if task >= tasks {
-                break;
-            }
-            f(task, worker);
-        }
-    };
-    std::thread::scope(|scope| {
-        for worker in 1..threads.min(tasks) {
-            scope.spawn(move || work(worker));
-        }
-        work(0);
-    });
 }
