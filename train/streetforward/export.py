@@ -8,9 +8,8 @@ import argparse
 import sys
 from pathlib import Path
 
-import numpy as np
 import torch
-from safetensors.torch import save
+from safetensors.torch import save_file
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from . import config as cfg
@@ -25,7 +24,7 @@ F32_LIMIT = 3e-5
 def write(path, tensors, metadata):
     """Writes a safetensors file whole or not at all."""
     partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(save(tensors, metadata))
+    save_file(tensors, partial, metadata)
     partial.replace(path)
 
 
