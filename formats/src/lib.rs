@@ -3,7 +3,8 @@
 //! | file | what |
 //! |---|---|
 //! | `error.rs` | [`Error`], [`Status`]: one line per fault, exit code = C API value |
-//! | `config.rs` | [`ModelConfig`]: every size and every convention of the network, presets |
+//! | `config.rs` | [`ModelConfig`]: every size and every convention of the network |
+//! | `setting.rs`, `presets.rs`, `config_check.rs` | its value types, its named instances, its caps |
 //! | `arch.rs` | the exact set of tensors a [`ModelConfig`] asks for |
 //! | `blob.rs` | [`Blob`]: the `.sfw` weight file, validated and used in place |
 //! | `blob_check.rs` | its validation, cheapest step first |
@@ -36,6 +37,7 @@ pub mod camera;
 pub mod checkpoint;
 pub mod clip;
 pub mod config;
+mod config_check;
 pub mod digest;
 pub mod error;
 pub mod image_io;
@@ -44,8 +46,10 @@ mod map;
 pub mod meta;
 pub mod npy;
 pub mod panel;
+mod presets;
 mod safetensors_in;
 pub mod scene;
+mod setting;
 pub mod sniff;
 #[cfg(feature = "pytorch")]
 mod torch_in;
