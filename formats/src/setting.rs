@@ -209,7 +209,7 @@ choice! {
         FitShared = "fit_shared",
         /// The same, each frame for itself.
         FitFrame = "fit_frame",
-        /// Two field-of-view channels of the camera head (`camera_head.fc_fov`): log(fx/W), log(fy/W).
+        /// Two field-of-view channels of the camera head (`camera_head.fc_fov`): log(fx/W), log(fy/H).
         Fov = "fov",
     }
 }
