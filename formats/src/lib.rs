@@ -20,6 +20,9 @@
 //! | `safetensors_in.rs`, `torch_in.rs` | the two checkpoint formats |
 //! | `clip.rs`, `truth.rs`, `transforms.rs` | [`clip::Clip`]: frames, times, reference poses, ground truth |
 //! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
+//! | `picture.rs` | depth, velocity and other numbers as pictures with a known scale |
+//! | `scene_io.rs`, `ply.rs` | [`Scene::save`], [`Scene::load`]; splats as PLY and PLY sequences |
+//! | `camera_json.rs`, `poses_io.rs` | camera paths; poses for nerfstudio, TUM, KITTI, COLMAP |
 //! | `sniff.rs`, `json.rs` | what a file is by its content; JSON without equal keys |
 //! | `scene.rs` | [`Scene`]: moving Gaussians; the composition at any time |
 //!
@@ -34,6 +37,7 @@ mod blob_check;
 pub mod blob_layout;
 pub mod blob_writer;
 pub mod camera;
+pub mod camera_json;
 pub mod checkpoint;
 pub mod clip;
 pub mod config;
@@ -46,9 +50,14 @@ mod map;
 pub mod meta;
 pub mod npy;
 pub mod panel;
+pub mod picture;
+pub mod ply;
+pub mod poses_io;
 mod presets;
+mod real;
 mod safetensors_in;
 pub mod scene;
+pub mod scene_io;
 mod setting;
 pub mod sniff;
 #[cfg(feature = "pytorch")]

@@ -1,7 +1,7 @@
 //! Which kind of file this is, by its content: a wrong file is named in the message.
 
 use crate::error::{Error, Result};
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -122,17 +122,10 @@ impl FileKind {
     }
 }
 
-/// Opens a regular file for reading and gives its length; folders, pipes and devices are refused
-/// before they are opened, so a pipe without a writer cannot block.
+/// Opens a regular file for reading and gives its length; folders, pipes and devices are refused.
 pub(crate) fn open_regular(path: &Path) -> Result<(File, u64)> {
-    let meta = fs::metadata(path).map_err(|e| Error::io(path, "open", &e))?;
-    if !meta.is_file() {
-        let e = std::io::Error::other("it is not a regular file");
-        return Err(Error::io(path, "open", &e));
-    }
-    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-    let length = file.metadata().map_err(|e| Error::io(path, "open", &e))?.len();
-    Ok((file, length))
+    let (file, identity) = crate::map::open_regular(path)?;
+    Ok((file, identity.bytes()))
 }
 
 /// A whole regular file in memory, read once; longer than `cap` bytes gives `None`.

@@ -135,7 +135,7 @@ pub struct ClipWriter {
 impl ClipWriter {
     /// Makes the folder; with [`Overwrite::No`] it must be absent or empty.
     pub fn create(folder: &Path, overwrite: Overwrite) -> Result<ClipWriter> {
-        atomic_folder(folder, overwrite)?;
+        output_folder(folder, overwrite)?;
         Ok(ClipWriter { folder: folder.to_path_buf(), overwrite, views: Mutex::default() })
     }
 
@@ -185,7 +185,7 @@ impl ClipWriter {
 }
 
 /// Makes an output folder; with [`Overwrite::No`] an existing one must be empty.
-pub(crate) fn atomic_folder(folder: &Path, overwrite: Overwrite) -> Result<()> {
+pub(crate) fn output_folder(folder: &Path, overwrite: Overwrite) -> Result<()> {
     if overwrite == Overwrite::No
         && let Ok(mut entries) = std::fs::read_dir(folder)
         && entries.next().is_some()
