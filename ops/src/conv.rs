@@ -5,9 +5,10 @@
 //! no column buffer exists. A transposed convolution with stride = kernel is one product whose
 //! outputs `[ky][kx][out]` are scattered while they are stored.
 
-use crate::cpu::Ctx;
-use crate::gemm::{Act, Epilogue, Panels, gemm};
-use crate::mat::{Hwc, HwcMut, Mat, MatMut};
+use crate::cpu::{Ctx, Kernels};
+use crate::gemm::{Act, AddTo, NR, Panels, Product, RowSink, Rows, Sink, Source, product};
+use crate::mat::{Hwc, HwcMut};
+use crate::par::SharedMut;
 
 /// A convolution layer.
 #[derive(Clone, Copy, Debug)]
@@ -70,46 +71,112 @@ pub fn conv_transpose_rows(weight: &[f32], inp: usize, out: usize, kernel: usize
     rows
 }
 
-/// `x` `[h, w, in]` -> `out` `[conv_out(h), conv_out(w), out]`, zero padding; then `out + residual` when there is one
-/// of the output's size.
-pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut) {
-    let Conv { weight, kernel, stride, pad, .. } = *conv;
-    let k = kernel * kernel * x.c;
-    let mut cols = vec![0.0f32; out.h * out.w * k];
-    for oy in 0..out.h {
-        for ox in 0..out.w {
-            for t in 0..kernel * kernel {
-                let (y, xx) = (oy * stride + t / kernel, ox * stride + t % kernel);
-                if y < pad || xx < pad || y - pad >= x.h || xx - pad >= x.w {
+/// Rows of a product that are windows of an image.
+struct Windows<'a> {
+    x: Hwc<'a>,
+    ow: usize,
+    kernel: usize,
+    stride: usize,
+    pad: usize,
+    relu: bool,
+}
+
+impl Source for Windows<'_> {
+    fn pack(&self, _kernels: &Kernels, first: usize, rows: usize, width: usize, out: &mut [f32]) {
+        let Windows { x, ow, kernel, stride, pad, relu } = *self;
+        let c = x.c;
+        out[..kernel * kernel * c * width].fill(0.0);
+        for r in 0..rows {
+            let (oy, ox) = ((first + r) / ow, (first + r) % ow);
+            for ky in 0..kernel {
+                let y = oy * stride + ky;
+                if y < pad || y - pad >= x.h {
                     continue;
                 }
-                for (i, v) in x.pixel(y - pad, xx - pad).iter().enumerate() {
-                    cols[(oy * out.w + ox) * k + t * x.c + i] = crate::reference::activate(*v, conv.relu_input);
+                // Columns of the kernel inside the image: their pixels are neighbours in memory.
+                let left = ox * stride;
+                let kx0 = pad.saturating_sub(left);
+                let kx1 = kernel.min((x.w + pad).saturating_sub(left));
+                if kx0 >= kx1 {
+                    continue;
+                }
+                let run = &x.data[((y - pad) * x.w + left + kx0 - pad) * c..][..(kx1 - kx0) * c];
+                let to = &mut out[(ky * kernel + kx0) * c * width..];
+                if relu {
+                    for (v, o) in run.iter().zip(to[r..].iter_mut().step_by(width)) {
+                        *o = if *v < 0.0 { 0.0 } else { *v };
+                    }
+                } else {
+                    for (v, o) in run.iter().zip(to[r..].iter_mut().step_by(width)) {
+                        *o = *v;
+                    }
                 }
             }
         }
     }
-    let HwcMut { data, h, w, c } = out;
-    let ep = Epilogue { bias: conv.bias, act: conv.act, ..Epilogue::default() };
-    gemm(ctx, Mat::new(&cols, h * w, k), weight, ep, MatMut::new(data, h * w, c));
+}
+
+/// `x` `[h, w, in]` -> `out` `[conv_out(h), conv_out(w), out]`, zero padding; then `residual + output` when there is
+/// a residual, of the output's size.
+pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut) {
+    let Conv { weight, kernel, stride, pad, .. } = *conv;
+    let weight = weight.checked();
+    assert!(stride > 0, "a convolution of stride 0");
+    assert_eq!(weight.k, kernel * kernel * x.c, "inputs of a {kernel} x {kernel} convolution over {} channels", x.c);
+    let (oh, ow) = (conv_out(x.h, kernel, stride, pad), conv_out(x.w, kernel, stride, pad));
+    assert_eq!((out.h, out.w, out.c), (oh, ow, weight.n), "output of a convolution");
+    assert!(conv.bias.is_none_or(|b| b.len() == weight.n), "bias of {} outputs", weight.n);
+    assert!(conv.relu_input != Act::Gelu, "only relu is applied to inputs on the fly");
     if let Some(r) = residual {
-        crate::elementwise::add_assign(ctx, data, r.data);
+        assert_eq!((r.h, r.w, r.c), (oh, ow, weight.n), "residual of a convolution");
+    }
+    let add = residual.map_or(AddTo::Nothing, |r| AddTo::Other(r.as_mat()));
+    let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
+    let sink = RowSink { out: SharedMut::new(out.data), stride: weight.n, add };
+    let (bias, act) = (conv.bias, conv.act);
+    product(ctx, &Product { m: oh * ow, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
+}
+
+/// Outputs `[ky][kx][out]` of input pixel (y, x) go to pixels (y k + ky, x k + kx).
+struct Scatter<'a> {
+    out: SharedMut<'a, f32>,
+    /// Input width.
+    w: usize,
+    kernel: usize,
+    /// Outputs of one line of the kernel: kernel * out.
+    line: usize,
+}
+
+impl Sink for Scatter<'_> {
+    fn put(&self, row: usize, col: usize, cols: usize, values: &[f32]) {
+        for (r, v) in values.as_chunks::<NR>().0.iter().enumerate() {
+            let (y, x) = ((row + r) / self.w, (row + r) % self.w);
+            let mut c = 0;
+            // A run of columns may cross from one line of the kernel to the next.
+            while c < cols {
+                let (ky, within) = ((col + c) / self.line, (col + c) % self.line);
+                let len = (self.line - within).min(cols - c);
+                let at = ((y * self.kernel + ky) * self.w + x) * self.line + within;
+                // SAFETY: the map from (row, column) to outputs is one to one and each is put once.
+                #[allow(unsafe_code)]
+                let out = unsafe { self.out.slice(at..at + len) };
+                out.copy_from_slice(&v[c..c + len]);
+                c += len;
+            }
+        }
     }
 }
 
 /// `x` `[h, w, in]` -> `out` `[h * kernel, w * kernel, out]`.
 pub fn conv_transpose(ctx: Ctx, x: Hwc, conv: &ConvTranspose, out: HwcMut) {
-    let n = conv.weight.n;
-    let c = out.c;
-    let kernel = conv.kernel;
-    let mut y = vec![0.0f32; x.h * x.w * n];
-    gemm(ctx, x.as_mat(), conv.weight, Epilogue::default(), MatMut::new(&mut y, x.h * x.w, n));
-    for oy in 0..out.h {
-        for ox in 0..out.w {
-            for o in 0..c {
-                let from = y[((oy / kernel) * x.w + ox / kernel) * n + ((oy % kernel) * kernel + ox % kernel) * c + o];
-                out.data[(oy * out.w + ox) * c + o] = from + conv.bias.map_or(0.0, |b| b[o]);
-            }
-        }
-    }
+    let ConvTranspose { weight, bias, kernel } = *conv;
+    let weight = weight.checked();
+    assert_eq!(weight.k, x.c, "inputs of a transposed convolution");
+    assert_eq!(weight.n, kernel * kernel * out.c, "outputs of a {kernel} x {kernel} transposed convolution");
+    assert_eq!((out.h, out.w), (x.h * kernel, x.w * kernel), "size of a transposed convolution");
+    assert!(bias.is_none_or(|b| b.len() == out.c), "bias of {} outputs", out.c);
+    let (m, act) = (x.h * x.w, Act::None);
+    let source = Rows(x.as_mat());
+    let sink = Scatter { w: x.w, kernel, line: kernel * out.c, out: SharedMut::new(out.data) };
+    product(ctx, &Product { m, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }

@@ -5,7 +5,7 @@
 //! [`Kernels::capped`] and can only lower what was detected. A cap that this CPU does not have is an
 //! error, never a silent fallback.
 
-use crate::gemm::table::{GEMM_F, GemmKernel};
+use crate::gemm::table::{GEMM_F, GemmKernel, WeightType};
 use crate::simd::table::{VECTOR, VectorKernels};
 use std::sync::OnceLock;
 
@@ -147,8 +147,10 @@ fn detect() -> Features {
     Features::NONE
 }
 
-/// The kernels in use: one row of every table.
+/// The kernels in use: one row of every table. Made only here, where rows are chosen under the detected
+/// features, so that a value proves that they may run.
 #[derive(Debug)]
+#[non_exhaustive]
 pub struct Kernels {
     /// The cap these rows were chosen under.
     pub isa: Isa,
@@ -165,12 +167,12 @@ pub struct Kernels {
 impl Kernels {
     fn choose(isa: Isa) -> Kernels {
         let features = Features::detected().and(isa.features());
-        let gemm = |half| GEMM_F.iter().find(|k| k.is_half() == half && features.has(k.needs));
+        let gemm = |w| GEMM_F.iter().find(|k| k.weights == w && features.has(k.needs));
         Kernels {
             isa,
             features,
-            gemm_f32: gemm(false).expect("a scalar row ends the table"),
-            gemm_f16: gemm(true).expect("a scalar row ends the table"),
+            gemm_f32: gemm(WeightType::F32).expect("a scalar row ends the table"),
+            gemm_f16: gemm(WeightType::F16).expect("a scalar row ends the table"),
             vector: VECTOR.iter().find(|k| features.has(k.needs)).expect("a scalar row ends the table"),
         }
     }

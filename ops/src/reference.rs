@@ -14,7 +14,7 @@ use crate::trig;
 
 /// x W^T + b: `x` `[rows, k]`, `w` `[n, k]`, `bias` `[n]` -> `[rows, n]`.
 pub fn linear(x: Mat, w: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
-    let n = w.len().checked_div(x.cols).unwrap_or(0);
+    let n = w.len().checked_div(x.cols).unwrap_or(bias.map_or(0, <[f32]>::len));
     assert_eq!(w.len(), n * x.cols, "weights of {} inputs", x.cols);
     let mut out = Vec::with_capacity(x.rows * n);
     for r in 0..x.rows {

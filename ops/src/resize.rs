@@ -2,6 +2,7 @@
 
 use crate::cpu::Ctx;
 use crate::mat::{Hwc, HwcMut};
+use crate::simd::{LANES, Simd, Vector, padded};
 
 /// Which points of the two grids coincide.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,10 +24,67 @@ pub(crate) fn source(i: usize, n: usize, m: usize, corners: Corners) -> (usize, 
     (left, (left + 1).min(n - 1), at - left as f32)
 }
 
+/// One output line of a bilinear resize.
+pub(crate) struct BilinearRow<'a> {
+    /// Upper input line `[w, c]`.
+    pub top: &'a [f32],
+    /// Lower input line `[w, c]`.
+    pub bottom: &'a [f32],
+    /// Weight of the lower line.
+    pub fy: f32,
+    /// Channels.
+    pub c: usize,
+    /// Which points coincide.
+    pub corners: Corners,
+    /// Output line `[ow, c]`.
+    pub out: &'a mut [f32],
+}
+
+/// One output line: t = a (1-fx) + b fx on both lines, then t (1-fy) + u fy; the second product of each is fused.
+#[inline(always)]
+pub(crate) fn bilinear_row<S: Simd>(s: S, row: BilinearRow) {
+    let BilinearRow { top, bottom, fy, c, corners, out } = row;
+    let (w, ow) = (top.len() / c, out.len() / c);
+    let (y1, y0) = (s.splat(fy), s.splat(1.0 - fy));
+    for (i, pixel) in out.chunks_exact_mut(c).enumerate() {
+        let (left, right, fx) = source(i, w, ow, corners);
+        let (x1, x0) = (s.splat(fx), s.splat(1.0 - fx));
+        let mix = |a: S::V, b: S::V, e: S::V, f: S::V| {
+            let t = b.mul_add(x1, a * x0);
+            let u = f.mul_add(x1, e * x0);
+            u.mul_add(y1, t * y0)
+        };
+        let (ab, at) = top[left * c..][..c].as_chunks::<LANES>();
+        let (bb, bt) = top[right * c..][..c].as_chunks::<LANES>();
+        let (eb, et) = bottom[left * c..][..c].as_chunks::<LANES>();
+        let (fb, ft) = bottom[right * c..][..c].as_chunks::<LANES>();
+        let (ob, ot) = pixel.as_chunks_mut::<LANES>();
+        for ((((a, b), e), f), o) in ab.iter().zip(bb).zip(eb).zip(fb).zip(ob) {
+            mix(s.load(a), s.load(b), s.load(e), s.load(f)).store(o);
+        }
+        if !at.is_empty() {
+            let mut y = [0.0; LANES];
+            let (a, b) = (s.load(&padded(at, 0.0)), s.load(&padded(bt, 0.0)));
+            mix(a, b, s.load(&padded(et, 0.0)), s.load(&padded(ft, 0.0))).store(&mut y);
+            ot.copy_from_slice(&y[..ot.len()]);
+        }
+    }
+}
+
 /// Bilinear resize of `x` to the size of `out` (same channels).
-pub fn bilinear(_ctx: Ctx, x: Hwc, corners: Corners, out: HwcMut) {
-    let y = crate::reference::bilinear(x, corners, out.h, out.w);
-    out.data.copy_from_slice(&y);
+pub fn bilinear(ctx: Ctx, x: Hwc, corners: Corners, out: HwcMut) {
+    let c = x.c;
+    assert_eq!(out.c, c, "channels of a resize");
+    let (oh, line) = (out.h, out.w * c);
+    if oh * line == 0 {
+        return;
+    }
+    assert!(x.h > 0 && x.w > 0, "resize of an empty {} x {} image", x.h, x.w);
+    ctx.pool.chunks(out.data, line, &|oy, piece, _| {
+        let (y0, y1, fy) = source(oy, x.h, oh, corners);
+        let at = |y: usize| &x.data[y * x.w * c..][..x.w * c];
+        ctx.kernels.bilinear(BilinearRow { top: at(y0), bottom: at(y1), fy, c, corners, out: piece });
+    });
 }
 
 /// Kernel of [`resample_u8`].

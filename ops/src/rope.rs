@@ -7,7 +7,10 @@
 //! Tables are computed in f64 with [`crate::trig`] and stored as f32.
 
 use crate::cpu::Ctx;
+use crate::layernorm::moments;
 use crate::mat::MatMut;
+use crate::par::SharedMut;
+use crate::simd::{LANES, Simd, Vector, padded};
 use crate::trig;
 
 /// What happens to an angle before its sine and cosine are taken.
@@ -99,20 +102,104 @@ pub struct QkNorm<'a> {
     pub eps: f32,
 }
 
-/// Norm then rotation of the q and k parts of `qkv` `[rows, 3 * heads * d]`, in place; row r uses table entry
-/// r modulo the table's length.
-pub fn qk_norm_rope(_ctx: Ctx, qkv: MatMut, heads: usize, norm: Option<QkNorm>, rope: Option<&RopeTable>) {
-    let MatMut { data, rows, cols, stride } = qkv;
-    for r in 0..rows {
-        let row = &mut data[r * stride..][..cols];
-        let one = rope.map(|t| t.single(r % t.len()));
-        crate::reference::qk_norm_rope(row, 1, heads, norm.as_ref(), one.as_ref());
+/// The q and k parts of one token.
+pub(crate) struct RopeRow<'a> {
+    /// q | k, `2 * heads * d` values.
+    pub qk: &'a mut [f32],
+    /// Head width.
+    pub d: usize,
+    /// Norm of q and k.
+    pub norm: Option<&'a QkNorm<'a>>,
+    /// cos and sin of the token, d/2 values each.
+    pub turn: Option<(&'a [f32], &'a [f32])>,
+}
+
+/// a cos - b sin and b cos + a sin; the second product is rounded, the first fused.
+#[inline(always)]
+fn turn<V: Vector>(a: V, b: V, cos: V, sin: V, zero: V) -> (V, V) {
+    (a.mul_add(cos, zero - b * sin), b.mul_add(cos, a * sin))
+}
+
+/// Norm, then rotation, of every head of one token.
+#[inline(always)]
+pub(crate) fn rope_row<S: Simd>(s: S, row: RopeRow) {
+    let RopeRow { qk, d, norm, turn: table } = row;
+    let half = qk.len() / 2;
+    let zero = s.splat(0.0);
+    let quarter = d / 4;
+    for (i, x) in qk.chunks_exact_mut(d).enumerate() {
+        if let Some(n) = norm {
+            let (gain, offset) = if i * d < half { (n.q_gain, n.q_offset) } else { (n.k_gain, n.k_offset) };
+            let (mean, scale) = moments(s, x, n.eps);
+            let (m, k) = (s.splat(mean), s.splat(scale));
+            let (xb, xt) = x.as_chunks_mut::<LANES>();
+            let (gb, gt) = gain.as_chunks::<LANES>();
+            let (ob, ot) = offset.as_chunks::<LANES>();
+            for ((x, g), o) in xb.iter_mut().zip(gb).zip(ob) {
+                ((s.load(x) - m) * k).mul_add(s.load(g), s.load(o)).store(x);
+            }
+            if !xt.is_empty() {
+                let mut y = [0.0; LANES];
+                let v = (s.load(&padded(xt, mean)) - m) * k;
+                v.mul_add(s.load(&padded(gt, 0.0)), s.load(&padded(ot, 0.0))).store(&mut y);
+                xt.copy_from_slice(&y[..xt.len()]);
+            }
+        }
+        let Some((cos, sin)) = table else { continue };
+        for h in 0..2 {
+            let (a, b) = x[2 * h * quarter..][..2 * quarter].split_at_mut(quarter);
+            let (cos, sin) = (&cos[h * quarter..][..quarter], &sin[h * quarter..][..quarter]);
+            let (ab, at) = a.as_chunks_mut::<LANES>();
+            let (bb, bt) = b.as_chunks_mut::<LANES>();
+            let (cb, ct) = cos.as_chunks::<LANES>();
+            let (sb, st) = sin.as_chunks::<LANES>();
+            for (((a, b), c), sn) in ab.iter_mut().zip(bb).zip(cb).zip(sb) {
+                let (p, q) = turn(s.load(a), s.load(b), s.load(c), s.load(sn), zero);
+                p.store(a);
+                q.store(b);
+            }
+            if !at.is_empty() {
+                let at_lanes = s.load(&padded(at, 0.0));
+                let bt_lanes = s.load(&padded(bt, 0.0));
+                let (p, q) = turn(at_lanes, bt_lanes, s.load(&padded(ct, 0.0)), s.load(&padded(st, 0.0)), zero);
+                let mut y = [0.0; LANES];
+                p.store(&mut y);
+                at.copy_from_slice(&y[..at.len()]);
+                q.store(&mut y);
+                bt.copy_from_slice(&y[..bt.len()]);
+            }
+        }
     }
 }
 
-impl RopeTable {
-    fn single(&self, token: usize) -> RopeTable {
-        let (cos, sin) = self.entry(token);
-        RopeTable { cos: cos.to_vec(), sin: sin.to_vec(), tokens: 1, head_dim: self.head_dim }
+/// Rows of one task.
+const TASK_ROWS: usize = 16;
+
+/// Norm then rotation of the q and k parts of `qkv` `[rows, 3 * heads * d]`, in place; row r uses table entry
+/// r modulo the table's length.
+pub fn qk_norm_rope(ctx: Ctx, qkv: MatMut, heads: usize, norm: Option<QkNorm>, rope: Option<&RopeTable>) {
+    let MatMut { data, rows, cols, stride } = qkv;
+    assert!(heads > 0 && cols.is_multiple_of(3 * heads), "{cols} columns for {heads} heads");
+    let d = cols / (3 * heads);
+    if let Some(n) = &norm {
+        for v in [n.q_gain, n.q_offset, n.k_gain, n.k_offset] {
+            assert_eq!(v.len(), d, "gains and offsets of a head of width {d}");
+        }
     }
+    if let Some(t) = rope {
+        assert!(t.head_dim() == d && !t.is_empty(), "a rotary table of width {} for heads of {d}", t.head_dim());
+    }
+    if d == 0 || norm.is_none() && rope.is_none() {
+        return;
+    }
+    let shared = SharedMut::new(data);
+    ctx.pool.run(rows.div_ceil(TASK_ROWS), &|task, _| {
+        for r in task * TASK_ROWS..((task + 1) * TASK_ROWS).min(rows) {
+            // SAFETY: rows are disjoint and each belongs to one task.
+            #[allow(unsafe_code)]
+            let qk = unsafe { shared.slice(r * stride..r * stride + 2 * heads * d) };
+            let turn = rope.map(|t| t.entry(r % t.len()));
+            ctx.kernels.rope(RopeRow { qk, d, norm: norm.as_ref(), turn });
+        }
+    });
 }

@@ -95,6 +95,47 @@ pub fn unpack(panels: Panels) -> Vec<f32> {
     w
 }
 
+/// Rows of activations to be packed for a tile: `out[k][r] = scale * x[r][k]`.
+pub(crate) struct RowPack<'a> {
+    /// Row 0.
+    pub x: &'a [f32],
+    /// Values from one row to the next.
+    pub stride: usize,
+    /// Rows that exist.
+    pub rows: usize,
+    /// Values of each row to take.
+    pub k: usize,
+    /// Rows of the tile; those beyond `rows` are zeros.
+    pub width: usize,
+    /// Factor of every value.
+    pub scale: f32,
+    /// `[k][width]`.
+    pub out: &'a mut [f32],
+}
+
+/// Steps of k taken from one row before the next: a cache line of each row stays in use.
+const STEP: usize = 16;
+
+/// Packs rows. Plain indexing: it moves each value once for every pass over the weights.
+#[inline(always)]
+pub(crate) fn pack_rows(t: RowPack) {
+    let RowPack { x, stride, rows, k, width, scale, out } = t;
+    let out = &mut out[..k * width];
+    if rows < width {
+        out.fill(0.0);
+    }
+    for k0 in (0..k).step_by(STEP) {
+        let len = STEP.min(k - k0);
+        let block = &mut out[k0 * width..][..len * width];
+        for r in 0..rows {
+            let from = &x[r * stride + k0..][..len];
+            for (v, o) in from.iter().zip(block[r..].iter_mut().step_by(width)) {
+                *o = v * scale;
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,2 +1,93 @@
-//! Sixteen-lane vectors.
+//! Vectors of sixteen f32 lanes, on every instruction set.
+//!
+//! The width is fixed so that sums fold the same way everywhere: one register with AVX-512, two with AVX2,
+//! four with NEON, an array in portable code. Every operation is an IEEE basic operation, a fused
+//! multiply-add, a compare-select or a bit shift, so a body written once over [`Simd`] gives the same bits on
+//! every CPU.
+//!
+//! [`Simd`] is a token: the value exists only inside a `#[target_feature]` entry point, and a [`Vector`] comes only from a
+//! token, so holding either proves that the CPU has the instructions. Bodies are `#[inline(always)]` into
+//! that entry point; a body that is not inlined loses the instructions and runs tens of times slower.
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx2;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx512;
+pub(crate) mod scalar;
 pub mod table;
+
+use std::ops::{Add, Div, Mul, Sub};
+
+/// Lanes of a vector.
+pub(crate) const LANES: usize = 16;
+
+/// Token of an instruction set.
+pub(crate) trait Simd: Copy {
+    /// Its vectors.
+    type V: Vector;
+    /// Every lane `x`.
+    fn splat(self, x: f32) -> Self::V;
+    /// Lane i from `x[i]`.
+    fn load(self, x: &[f32; LANES]) -> Self::V;
+    /// Lane i from the half-precision bits `x[i]`; exact.
+    fn load_f16(self, x: &[u16; LANES]) -> Self::V;
+}
+
+/// Sixteen f32 lanes.
+pub(crate) trait Vector:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
+{
+    /// Lane i to `x[i]`.
+    fn store(self, x: &mut [f32; LANES]);
+    /// self * a + b, rounded once.
+    fn mul_add(self, a: Self, b: Self) -> Self;
+    /// self > other ? self : other; a NaN on either side gives `other`.
+    fn max(self, other: Self) -> Self;
+    /// Lanes of `yes` where self > other, of `no` elsewhere (also for NaN).
+    fn select_gt(self, other: Self, yes: Self, no: Self) -> Self;
+    /// Clears the sign bit.
+    fn abs(self) -> Self;
+    /// (bits(self) << 23) + (`bias` << 23) as float: 2^(n + bias - 127) when the low bits of self hold n.
+    fn pow2_of_low_bits(self, bias: i32) -> Self;
+}
+
+/// Sum of the lanes in the one fixed order: l + (l+8), then +4, +2, +1.
+#[inline(always)]
+pub(crate) fn fold_add<V: Vector>(v: V) -> f32 {
+    let mut x = [0.0f32; LANES];
+    v.store(&mut x);
+    for half in [8, 4, 2, 1] {
+        for l in 0..half {
+            x[l] += x[l + half];
+        }
+    }
+    x[0]
+}
+
+/// A copy of up to 16 values, the rest filled with `fill`.
+#[inline(always)]
+pub(crate) fn padded(x: &[f32], fill: f32) -> [f32; LANES] {
+    let mut lanes = [fill; LANES];
+    lanes[..x.len()].copy_from_slice(x);
+    lanes
+}
+
+/// A function of one lane, written over any instruction set.
+pub(crate) trait Lanewise {
+    /// Of every lane.
+    fn apply<S: Simd>(s: S, x: S::V) -> S::V;
+}
+
+/// x = F(x) over a slice of any length.
+#[inline(always)]
+pub(crate) fn map<S: Simd, F: Lanewise>(s: S, x: &mut [f32]) {
+    let (blocks, tail) = x.as_chunks_mut::<LANES>();
+    for block in blocks {
+        F::apply(s, s.load(block)).store(block);
+    }
+    if !tail.is_empty() {
+        let mut block = padded(tail, 0.0);
+        F::apply(s, s.load(&block)).store(&mut block);
+        tail.copy_from_slice(&block[..tail.len()]);
+    }
+}

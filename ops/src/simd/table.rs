@@ -1,6 +1,18 @@
-//! The list of vector kernels, best first.
+//! The list of vector kernels, best first, and the one safe way to call them.
+//!
+//! A row holds entry points compiled for one instruction set; each is the generic body of the op named in its
+//! comment. A new instruction set is a file beside this one with an `impl Simd` and a `vector_kernels!` line, and
+//! a row in [`VECTOR`].
+#![allow(unsafe_code)]
 
-use crate::cpu::Features;
+use crate::activation::Map;
+use crate::attention::SoftmaxTile;
+use crate::cpu::{Features, Kernels};
+use crate::gemm::pack::RowPack;
+use crate::gemm::tile::Finish;
+use crate::layernorm::NormRow;
+use crate::resize::BilinearRow;
+use crate::rope::RopeRow;
 
 /// The element-wise and row-wise kernels of one instruction set.
 #[derive(Debug)]
@@ -9,7 +21,135 @@ pub struct VectorKernels {
     pub name: &'static str,
     /// Features they need.
     pub needs: Features,
+    /// `activation::map_body`.
+    pub(crate) map: unsafe fn(Map, &mut [f32]),
+    /// `elementwise::add_body`: x += y.
+    pub(crate) add: unsafe fn(&mut [f32], &[f32]),
+    /// `layernorm::norm_row`.
+    pub(crate) norm: unsafe fn(NormRow),
+    /// `rope::rope_row`.
+    pub(crate) rope: unsafe fn(RopeRow),
+    /// `attention::softmax_tile`.
+    pub(crate) softmax: unsafe fn(SoftmaxTile),
+    /// `gemm::tile::finish`.
+    pub(crate) finish: unsafe fn(Finish),
+    /// `gemm::pack::pack_rows`.
+    pub(crate) pack: unsafe fn(RowPack),
+    /// `resize::bilinear_row`.
+    pub(crate) bilinear: unsafe fn(BilinearRow),
 }
 
 /// Every set.
-pub static VECTOR: &[VectorKernels] = &[VectorKernels { name: "vector_scalar", needs: Features::NONE }];
+pub static VECTOR: &[&VectorKernels] = &[
+    #[cfg(target_arch = "x86_64")]
+    &super::avx512::VECTOR,
+    #[cfg(target_arch = "x86_64")]
+    &super::avx2::VECTOR,
+    &super::scalar::VECTOR,
+];
+
+/// One static row of entry points: each takes the token, which is safe to make where the features are on.
+macro_rules! vector_kernels {
+    ($name:literal, $needs:expr, $token:ident $(, $features:literal)?) => {
+        pub(crate) static VECTOR: crate::simd::table::VectorKernels = {
+            $(#[target_feature(enable = $features)])?
+            fn map(op: crate::activation::Map, x: &mut [f32]) {
+                crate::activation::map_body($token::new(), op, x);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn add(x: &mut [f32], y: &[f32]) {
+                crate::elementwise::add_body($token::new(), x, y);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn norm(row: crate::layernorm::NormRow) {
+                crate::layernorm::norm_row($token::new(), row);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn rope(row: crate::rope::RopeRow) {
+                crate::rope::rope_row($token::new(), row);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn softmax(tile: crate::attention::SoftmaxTile) {
+                crate::attention::softmax_tile($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn finish(tile: crate::gemm::tile::Finish) {
+                crate::gemm::tile::finish($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn pack(rows: crate::gemm::pack::RowPack) {
+                crate::gemm::pack::pack_rows(rows);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn bilinear(row: crate::resize::BilinearRow) {
+                crate::resize::bilinear_row($token::new(), row);
+            }
+            crate::simd::table::VectorKernels {
+                name: $name,
+                needs: $needs,
+                map,
+                add,
+                norm,
+                rope,
+                softmax,
+                finish,
+                pack,
+                bilinear,
+            }
+        };
+    };
+}
+pub(crate) use vector_kernels;
+
+// A `Kernels` value is only made by `Kernels::choose`, which takes rows whose needs are among the detected
+// features; this is the SAFETY argument of every call below. Lengths are checked inside the bodies, which
+// are safe code.
+impl Kernels {
+    #[inline]
+    pub(crate) fn map(&self, op: Map, x: &mut [f32]) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.map)(op, x) }
+    }
+
+    #[inline]
+    pub(crate) fn add(&self, x: &mut [f32], y: &[f32]) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.add)(x, y) }
+    }
+
+    #[inline]
+    pub(crate) fn norm(&self, row: NormRow) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.norm)(row) }
+    }
+
+    #[inline]
+    pub(crate) fn rope(&self, row: RopeRow) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.rope)(row) }
+    }
+
+    #[inline]
+    pub(crate) fn softmax(&self, tile: SoftmaxTile) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.softmax)(tile) }
+    }
+
+    #[inline]
+    pub(crate) fn finish(&self, tile: Finish) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.finish)(tile) }
+    }
+
+    #[inline]
+    pub(crate) fn pack(&self, rows: RowPack) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.pack)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn bilinear(&self, row: BilinearRow) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.bilinear)(row) }
+    }
+}

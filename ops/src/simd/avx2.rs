@@ -1,0 +1,145 @@
+//! AVX2 + FMA + F16C: sixteen lanes are two 256-bit registers.
+//!
+//! Tile 6 x 16: 12 accumulators, two weight registers and one broadcast leave one of the 16 registers.
+#![allow(unsafe_code)]
+
+use super::{LANES, Simd, Vector};
+use std::arch::x86_64::*;
+use std::ops::{Add, Div, Mul, Sub};
+
+/// Token: this CPU has avx2, fma and f16c.
+#[derive(Clone, Copy)]
+pub(crate) struct Avx2(());
+
+/// Low and high eight lanes. Invariant: made from an [`Avx2`] token only.
+#[derive(Clone, Copy)]
+pub(crate) struct V(__m256, __m256);
+
+impl Avx2 {
+    /// The token; safe to call where the features are enabled.
+    #[inline]
+    #[target_feature(enable = "avx2,fma,f16c")]
+    pub(crate) fn new() -> Self {
+        Avx2(())
+    }
+}
+
+// Every SAFETY line below: the token, or the vector made from it, proves the features; array references give
+// the bounds, and the loads and stores are unaligned ones.
+impl Simd for Avx2 {
+    type V = V;
+
+    #[inline(always)]
+    fn splat(self, x: f32) -> V {
+        // SAFETY: the token proves avx2.
+        unsafe { V(_mm256_set1_ps(x), _mm256_set1_ps(x)) }
+    }
+
+    #[inline(always)]
+    fn load(self, x: &[f32; LANES]) -> V {
+        // SAFETY: the token proves avx2; 16 values are readable.
+        unsafe { V(_mm256_loadu_ps(x.as_ptr()), _mm256_loadu_ps(x.as_ptr().add(8))) }
+    }
+
+    #[inline(always)]
+    fn load_f16(self, x: &[u16; LANES]) -> V {
+        // SAFETY: the token proves f16c; 16 values of 2 bytes are readable.
+        unsafe {
+            let p = x.as_ptr().cast::<__m128i>();
+            V(_mm256_cvtph_ps(_mm_loadu_si128(p)), _mm256_cvtph_ps(_mm_loadu_si128(p.add(1))))
+        }
+    }
+}
+
+impl Add for V {
+    type Output = V;
+    #[inline(always)]
+    fn add(self, o: V) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe { V(_mm256_add_ps(self.0, o.0), _mm256_add_ps(self.1, o.1)) }
+    }
+}
+
+impl Sub for V {
+    type Output = V;
+    #[inline(always)]
+    fn sub(self, o: V) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe { V(_mm256_sub_ps(self.0, o.0), _mm256_sub_ps(self.1, o.1)) }
+    }
+}
+
+impl Mul for V {
+    type Output = V;
+    #[inline(always)]
+    fn mul(self, o: V) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe { V(_mm256_mul_ps(self.0, o.0), _mm256_mul_ps(self.1, o.1)) }
+    }
+}
+
+impl Div for V {
+    type Output = V;
+    #[inline(always)]
+    fn div(self, o: V) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe { V(_mm256_div_ps(self.0, o.0), _mm256_div_ps(self.1, o.1)) }
+    }
+}
+
+impl Vector for V {
+    #[inline(always)]
+    fn store(self, x: &mut [f32; LANES]) {
+        // SAFETY: the vector proves avx2; 16 values are writable.
+        unsafe {
+            _mm256_storeu_ps(x.as_mut_ptr(), self.0);
+            _mm256_storeu_ps(x.as_mut_ptr().add(8), self.1);
+        }
+    }
+
+    #[inline(always)]
+    fn mul_add(self, a: V, b: V) -> V {
+        // SAFETY: the vector proves fma.
+        unsafe { V(_mm256_fmadd_ps(self.0, a.0, b.0), _mm256_fmadd_ps(self.1, a.1, b.1)) }
+    }
+
+    #[inline(always)]
+    fn max(self, o: V) -> V {
+        // SAFETY: the vector proves avx2. maxps is exactly a > b ? a : b.
+        unsafe { V(_mm256_max_ps(self.0, o.0), _mm256_max_ps(self.1, o.1)) }
+    }
+
+    #[inline(always)]
+    fn select_gt(self, o: V, yes: V, no: V) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let lo = _mm256_cmp_ps::<_CMP_GT_OQ>(self.0, o.0);
+            let hi = _mm256_cmp_ps::<_CMP_GT_OQ>(self.1, o.1);
+            V(_mm256_blendv_ps(no.0, yes.0, lo), _mm256_blendv_ps(no.1, yes.1, hi))
+        }
+    }
+
+    #[inline(always)]
+    fn abs(self) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            V(_mm256_andnot_ps(sign, self.0), _mm256_andnot_ps(sign, self.1))
+        }
+    }
+
+    #[inline(always)]
+    fn pow2_of_low_bits(self, bias: i32) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let bias = _mm256_set1_epi32(bias << 23);
+            let scale = |x: __m256| {
+                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_slli_epi32::<23>(_mm256_castps_si256(x)), bias))
+            };
+            V(scale(self.0), scale(self.1))
+        }
+    }
+}
+
+super::table::vector_kernels!("vector_avx2", crate::cpu::Features::AVX2, Avx2, "avx2,fma,f16c");
+crate::gemm::tile::gemm_entries!(Avx2, rows [1, 2, 3, 4, 5, 6], panels [1], "avx2,fma,f16c");

@@ -1,0 +1,135 @@
+//! AVX-512 (F, BW, VL, DQ): sixteen lanes are one register.
+//!
+//! Tile 12 x 32: 24 accumulators and two weight registers leave six of the 32; the activation is a broadcast
+//! memory operand of the multiply-add.
+#![allow(unsafe_code)]
+
+use super::{LANES, Simd, Vector};
+use std::arch::x86_64::*;
+use std::ops::{Add, Div, Mul, Sub};
+
+/// Token: this CPU has avx512f, avx512bw, avx512vl and avx512dq.
+#[derive(Clone, Copy)]
+pub(crate) struct Avx512(());
+
+/// Sixteen lanes. Invariant: made from an [`Avx512`] token only.
+#[derive(Clone, Copy)]
+pub(crate) struct V(__m512);
+
+impl Avx512 {
+    /// The token; safe to call where the features are enabled.
+    #[inline]
+    #[target_feature(enable = "avx2,fma,f16c,avx512f,avx512bw,avx512vl,avx512dq")]
+    pub(crate) fn new() -> Self {
+        Avx512(())
+    }
+}
+
+// Every SAFETY line below: the token, or the vector made from it, proves the features; array references give
+// the bounds, and the loads and stores are unaligned ones.
+impl Simd for Avx512 {
+    type V = V;
+
+    #[inline(always)]
+    fn splat(self, x: f32) -> V {
+        // SAFETY: the token proves avx512f.
+        unsafe { V(_mm512_set1_ps(x)) }
+    }
+
+    #[inline(always)]
+    fn load(self, x: &[f32; LANES]) -> V {
+        // SAFETY: the token proves avx512f; 16 values are readable.
+        unsafe { V(_mm512_loadu_ps(x.as_ptr())) }
+    }
+
+    #[inline(always)]
+    fn load_f16(self, x: &[u16; LANES]) -> V {
+        // SAFETY: the token proves avx512f; 16 values of 2 bytes are readable.
+        unsafe { V(_mm512_cvtph_ps(_mm256_loadu_si256(x.as_ptr().cast::<__m256i>()))) }
+    }
+}
+
+impl Add for V {
+    type Output = V;
+    #[inline(always)]
+    fn add(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_add_ps(self.0, o.0)) }
+    }
+}
+
+impl Sub for V {
+    type Output = V;
+    #[inline(always)]
+    fn sub(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_sub_ps(self.0, o.0)) }
+    }
+}
+
+impl Mul for V {
+    type Output = V;
+    #[inline(always)]
+    fn mul(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_mul_ps(self.0, o.0)) }
+    }
+}
+
+impl Div for V {
+    type Output = V;
+    #[inline(always)]
+    fn div(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_div_ps(self.0, o.0)) }
+    }
+}
+
+impl Vector for V {
+    #[inline(always)]
+    fn store(self, x: &mut [f32; LANES]) {
+        // SAFETY: the vector proves avx512f; 16 values are writable.
+        unsafe { _mm512_storeu_ps(x.as_mut_ptr(), self.0) }
+    }
+
+    #[inline(always)]
+    fn mul_add(self, a: V, b: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_fmadd_ps(self.0, a.0, b.0)) }
+    }
+
+    #[inline(always)]
+    fn max(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f. maxps is exactly a > b ? a : b.
+        unsafe { V(_mm512_max_ps(self.0, o.0)) }
+    }
+
+    #[inline(always)]
+    fn select_gt(self, o: V, yes: V, no: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, o.0), no.0, yes.0)) }
+    }
+
+    #[inline(always)]
+    fn abs(self) -> V {
+        // SAFETY: the vector proves avx512dq.
+        unsafe { V(_mm512_andnot_ps(_mm512_set1_ps(-0.0), self.0)) }
+    }
+
+    #[inline(always)]
+    fn pow2_of_low_bits(self, bias: i32) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe {
+            let shifted = _mm512_slli_epi32::<23>(_mm512_castps_si512(self.0));
+            V(_mm512_castsi512_ps(_mm512_add_epi32(shifted, _mm512_set1_epi32(bias << 23))))
+        }
+    }
+}
+
+super::table::vector_kernels!(
+    "vector_avx512",
+    crate::cpu::Features::AVX2.with(crate::cpu::Features::AVX512),
+    Avx512,
+    "avx2,fma,f16c,avx512f,avx512bw,avx512vl,avx512dq"
+);
+crate::gemm::tile::gemm_entries!(Avx512, rows [1, 2, 4, 6, 8, 10, 12], panels [1, 2], "avx2,fma,f16c,avx512f,avx512bw,avx512vl,avx512dq");
