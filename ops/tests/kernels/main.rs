@@ -1,0 +1,11 @@
+//! Every kernel against its naive twin, over tails and extremes; bits equal on every instruction set of this CPU
+//! and on 1, 2 and 3 threads.
+
+mod attention;
+mod common;
+mod conv;
+mod gemm;
+mod lanes;
+mod resize;
+mod rows;
+mod tolerance;
