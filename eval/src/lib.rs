@@ -1,1 +1,19 @@
-//! To be written.
+//! How good a reconstruction is: metrics, and the 20-frame protocol.
+//!
+//! | file | what |
+//! |---|---|
+//! | `metrics.rs` | PSNR, depth, velocity, masks, poses: plain functions of arrays |
+//! | `ssim.rs` | structural similarity as scikit-image's default |
+//! | `align.rs` | the similarity transform between two sets of poses |
+//! | `protocol.rs` | [`Protocol`] and [`evaluate`]: which frames are context, which are tested, how |
+//! | `report.rs` | [`EvalReport`]: means per method and part, as JSON and as a Markdown table |
+#![deny(unsafe_code)]
+
+pub mod align;
+pub mod metrics;
+pub mod protocol;
+pub mod report;
+pub mod ssim;
+
+pub use protocol::{EvalClip, EvalFrame, EvalOptions, Protocol, TargetPoses, evaluate};
+pub use report::{EvalReport, Method, Metric, Part, Scores};
