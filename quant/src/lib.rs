@@ -2,14 +2,24 @@
 //!
 //! | file | what |
 //! |---|---|
+//! | `convert.rs` | [`convert()`]: a checkpoint to a `.sfw` blob, streaming |
+//! | `names.rs` | wrapper prefixes, VGGT's names, nearest names |
+//! | `detect.rs` | a configuration from names and shapes |
+//! | `report.rs` | [`Report`]: what a conversion did |
 //! | `seeded.rs` | [`Seeded`]: the random network of a configuration and a seed |
 //! | `rng.rs` | random numbers by position |
 //! | `safetensors_out.rs` | [`write_safetensors`] |
 #![deny(unsafe_code)]
 
+pub mod convert;
+mod detect;
+pub mod names;
+pub mod report;
 pub mod rng;
 mod safetensors_out;
 pub mod seeded;
 
+pub use convert::{Options, convert, convert_files, convert_to_bytes, parse_keep, plan};
+pub use report::Report;
 pub use safetensors_out::write_safetensors;
 pub use seeded::{Outputs, Seeded};

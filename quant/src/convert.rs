@@ -1,0 +1,420 @@
+//! Checkpoint to weight blob, one tensor in memory at a time.
+//!
+//! Matrices become f32 or f16 panels, everything else f32. At f16 these stay f32: the camera head and
+//! the output layer of every head (the log depth goes through an exponential, poses and velocities are
+//! small numbers; together under 0.3 % of the weights), matrices with a value beyond the range of f16,
+//! and what the caller keeps.
+
+use crate::detect::detect;
+use crate::names::{Names, WRAPPERS, nearest, resolve};
+use crate::report::{Origin, Report, TensorReport, first_five};
+use crate::seeded::{CONFIG_KEY, Outputs, Seeded, output_layer};
+use sf_formats::arch::{self, Role, TensorSpec};
+use sf_formats::atomic::{AtomicFile, Overwrite};
+use sf_formats::blob_writer::{BlobWriter, fits_f16};
+use sf_formats::checkpoint::{self, Checkpoint};
+use sf_formats::config::ModelConfig;
+use sf_formats::digest::hex;
+use sf_formats::error::{escape, escape_path};
+use sf_formats::meta::{Meta, keys};
+use sf_formats::sniff::FileKind;
+use sf_formats::{Dtype, Error, Result};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::sync_channel;
+
+/// What to convert to.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Type of the matrices.
+    pub precision: Dtype,
+    /// Exceptions by prefix of the name, first match wins; they concern matrices.
+    pub keep: Vec<(String, Dtype)>,
+    /// Configuration for a checkpoint that carries none.
+    pub config: Option<ModelConfig>,
+    /// Prefixes of tensors that may be missing; they start neutral.
+    pub allow_missing: Vec<String>,
+    /// Licence text for the blob; without it the checkpoint's own, or what is known of public weights.
+    pub licence: Option<String>,
+    /// The command, for the blob's provenance; may be empty.
+    pub command: String,
+}
+
+impl Options {
+    /// Plain conversion to a precision.
+    pub fn to(precision: Dtype) -> Options {
+        Options {
+            precision,
+            keep: Vec::new(),
+            config: None,
+            allow_missing: Vec::new(),
+            licence: None,
+            command: String::new(),
+        }
+    }
+}
+
+/// Reads an exception of the form `PREFIX=f16` or `PREFIX=f32`.
+pub fn parse_keep(text: &str) -> Result<(String, Dtype)> {
+    let parsed = text.rsplit_once('=').and_then(|(prefix, name)| {
+        let dtype = [Dtype::F32, Dtype::F16].into_iter().find(|d| d.name() == name)?;
+        (!prefix.is_empty()).then(|| (prefix.to_string(), dtype))
+    });
+    parsed.ok_or_else(|| {
+        Error::usage(format!("'{}' is not of the form PREFIX=f16 or PREFIX=f32", escape(text.as_bytes())))
+    })
+}
+
+/// What a conversion would do; reads names and shapes, no values.
+pub fn plan(source: &dyn Checkpoint, options: &Options) -> Result<Report> {
+    prepare(source, options).map(|(report, _)| report)
+}
+
+/// Converts files to a blob. The output must not be one of the inputs, nor a checkpoint.
+pub fn convert_files(inputs: &[PathBuf], output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
+    refuse_own_input(inputs, output)?;
+    let source = checkpoint::open(inputs)?;
+    convert(source.as_ref(), output, overwrite, options)
+}
+
+/// Converts an open checkpoint to a blob.
+pub fn convert(source: &dyn Checkpoint, output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
+    let (mut report, jobs) = prepare(source, options)?;
+    // An output that cannot be written is better known before gigabytes are hashed.
+    drop(AtomicFile::create(output, overwrite)?);
+    let meta = provenance(source, options, &mut report)?;
+    let mut writer = BlobWriter::create(output, overwrite, &report.config, &meta)?;
+    stream(source, &jobs, &mut writer, &mut report)?;
+    report.blob_digest = Some(writer.finish()?);
+    Ok(report)
+}
+
+/// Converts an open checkpoint to the bytes of a blob, for networks that fit into memory.
+pub fn convert_to_bytes(source: &dyn Checkpoint, options: &Options) -> Result<Vec<u8>> {
+    let (mut report, jobs) = prepare(source, options)?;
+    let meta = provenance(source, options, &mut report)?;
+    let mut writer = BlobWriter::in_memory(&report.config, &meta)?;
+    stream(source, &jobs, &mut writer, &mut report)?;
+    writer.finish_bytes()
+}
+
+/// Refuses to write over an input (by any name) or over a file that is itself a checkpoint.
+fn refuse_own_input(inputs: &[PathBuf], output: &Path) -> Result<()> {
+    // A path that does not exist cannot be one of the inputs, which do.
+    let Ok(target) = output.canonicalize() else { return Ok(()) };
+    let same = |input: &PathBuf| input.canonicalize().is_ok_and(|p| p == target) || same_file(input, output);
+    if inputs.iter().any(same) {
+        return Err(Error::usage(format!("{} is an input: choose another output", escape_path(output))));
+    }
+    let checkpoint = [FileKind::Safetensors, FileKind::Zip, FileKind::Pickle, FileKind::Tar];
+    if target.is_file() && FileKind::of_file(&target).is_ok_and(|k| checkpoint.contains(&k)) {
+        return Err(Error::usage(format!(
+            "{} is a checkpoint, perhaps a shard of the input: choose another output or remove it",
+            escape_path(output)
+        )));
+    }
+    Ok(())
+}
+
+/// Whether two paths are one file (hard links).
+fn same_file(a: &Path, b: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    match (std::fs::metadata(a), std::fs::metadata(b)) {
+        (Ok(a), Ok(b)) => a.dev() == b.dev() && a.ino() == b.ino(),
+        _ => false,
+    }
+}
+
+/// One tensor to write.
+struct Job {
+    spec: TensorSpec,
+    /// Index in the checkpoint, or in the neutral network.
+    from: (Origin, usize),
+    dtype: Dtype,
+}
+
+/// Names, configuration, the exact set of tensors, types: everything but values.
+fn prepare(source: &dyn Checkpoint, options: &Options) -> Result<(Report, Vec<Job>)> {
+    let at = source.describe();
+    let names = resolve(source.tensors(), &at)?;
+    let (config, config_source) = configuration(source, options, &names, &at)?;
+    let specs = arch::tensors(&config);
+    let (mut notes, mut ignored) = (Vec::new(), names.ignored.clone());
+    let licence = options
+        .licence
+        .clone()
+        .or_else(|| ["licence", "license"].iter().find_map(|k| source.metadata(k)).map(str::to_string))
+        .or_else(|| known_licence(&names, &specs));
+    check_image(source, &names, &config, &at)?;
+    let surplus = if names.vggt { surplus_pairs(&names, &config) } else { BTreeSet::new() };
+    if names.vggt {
+        notes.push(format!(
+            "VGGT names mapped: patch_embed to encoder, frame block j to decoder.{{2j}}, global block j to \
+             decoder.{{2j+1}}, {} tensors of later pairs left out",
+            surplus.len()
+        ));
+        ignored.extend(surplus.iter().cloned());
+    }
+    let from = check_set(source, &names, &surplus, &specs, options, &at)?;
+
+    let mut used = vec![false; options.keep.len()];
+    let (mut jobs, mut tensors) = (Vec::new(), Vec::new());
+    for (spec, from) in specs.into_iter().zip(from) {
+        let kept = options.keep.iter().position(|(prefix, _)| spec.name.starts_with(prefix.as_str()));
+        if let Some(k) = kept {
+            used[k] = true;
+        }
+        let dtype = match (spec.matrix(), kept) {
+            (None, _) => Dtype::F32,
+            (Some(_), Some(k)) => options.keep[k].1,
+            (Some(_), None) if is_sensitive(&spec.name) => Dtype::F32,
+            (Some(_), None) => options.precision,
+        };
+        tensors.push(TensorReport {
+            name: spec.name.clone(),
+            shape: spec.shape.clone(),
+            origin: from.0,
+            dtype,
+            bytes: 0,
+            promoted: false,
+            zero_outputs: 0,
+        });
+        jobs.push(Job { spec, from, dtype });
+    }
+    if let Some(k) = used.iter().position(|u| !u) {
+        let (prefix, dtype) = &options.keep[k];
+        return Err(Error::usage(format!(
+            "no tensor is left for '{}={}' to keep: its prefix matches none, or an earlier one takes them all",
+            escape(prefix.as_bytes()),
+            dtype.name()
+        )));
+    }
+    let report = Report {
+        config,
+        config_source,
+        source: at,
+        precision: options.precision,
+        tensors,
+        stripped: names.stripped.into_iter().collect(),
+        ignored,
+        notes,
+        licence,
+        source_digest: None,
+        blob_digest: None,
+    };
+    Ok((report, jobs))
+}
+
+/// Whether a matrix stays f32 by default.
+fn is_sensitive(name: &str) -> bool {
+    name.starts_with("camera_head.") || output_layer(name).is_some()
+}
+
+/// The checkpoint's own configuration, else the caller's, else what names and shapes say.
+fn configuration(
+    source: &dyn Checkpoint,
+    options: &Options,
+    names: &Names,
+    at: &str,
+) -> Result<(ModelConfig, &'static str)> {
+    let own = source.metadata(CONFIG_KEY).map(|text| ModelConfig::from_json(text, at)).transpose()?;
+    match (own, &options.config) {
+        (Some(own), Some(given)) if own != *given => {
+            let differs = own.to_pairs().into_iter().zip(given.to_pairs()).find(|(a, b)| a != b);
+            let key = differs.map_or_else(String::new, |(a, _)| a.0);
+            Err(Error::usage(format!("the configuration given differs from the checkpoint's own in {key}: give none")))
+        }
+        (Some(own), _) => Ok((own, "from the checkpoint")),
+        (None, Some(given)) => {
+            given.check(at)?;
+            Ok((given.clone(), "given"))
+        }
+        (None, None) => {
+            Ok((detect(source.tensors(), names, at)?, "read from names and shapes; conventions are defaults"))
+        }
+    }
+}
+
+/// The stored normalisation must be the configuration's.
+fn check_image(source: &dyn Checkpoint, names: &Names, config: &ModelConfig, at: &str) -> Result<()> {
+    let mut stored = Vec::new();
+    for (name, index, want) in
+        [("image_mean", names.image[0], config.image_mean), ("image_std", names.image[1], config.image_std)]
+    {
+        let Some(index) = index else { continue };
+        if source.tensors()[index].count() == 3 {
+            source.read_f32(index, &mut stored)?;
+        } else {
+            stored.clear();
+        }
+        // Stored as f32: equal to 1e-6 means the same number.
+        let same = stored.len() == 3 && stored.iter().zip(want).all(|(&s, w)| (f64::from(s) - w).abs() <= 1e-6);
+        if !same {
+            return Err(Error::model(at, format!("{name} is {stored:?}, the configuration says {want:?}")));
+        }
+    }
+    Ok(())
+}
+
+/// Names of VGGT's attention pairs beyond the depth of the configuration.
+fn surplus_pairs(names: &Names, config: &ModelConfig) -> BTreeSet<String> {
+    let beyond = |name: &&String| {
+        let layer = name.strip_prefix("decoder.").and_then(|r| r.split('.').next()).and_then(|i| i.parse::<u32>().ok());
+        layer.is_some_and(|i| i >= config.aa.depth)
+    };
+    names.index.keys().filter(beyond).cloned().collect()
+}
+
+/// Nothing missing, nothing unexpected, every shape equal; returns where each tensor comes from.
+fn check_set(
+    source: &dyn Checkpoint,
+    names: &Names,
+    surplus: &BTreeSet<String>,
+    specs: &[TensorSpec],
+    options: &Options,
+    at: &str,
+) -> Result<Vec<(Origin, usize)>> {
+    let (mut missing, mut shapes, mut from) = (Vec::new(), Vec::new(), Vec::new());
+    let mut unexpected: BTreeSet<&str> =
+        names.index.keys().map(String::as_str).filter(|n| !surplus.contains(*n)).collect();
+    for (i, spec) in specs.iter().enumerate() {
+        unexpected.remove(spec.name.as_str());
+        match names.index.get(&spec.name) {
+            Some(&index) => {
+                let found = &source.tensors()[index].shape;
+                if *found != spec.shape {
+                    shapes.push(format!("{} is {found:?}, must be {:?}", spec.name, spec.shape));
+                }
+                from.push((Origin::Checkpoint, index));
+            }
+            None => {
+                if !options.allow_missing.iter().any(|p| spec.name.starts_with(p.as_str())) {
+                    missing.push(spec.name.clone());
+                }
+                from.push((Origin::Initialised, i));
+            }
+        }
+    }
+    let mut faults = Vec::new();
+    if !missing.is_empty() {
+        faults.push(format!("{} missing: {}", missing.len(), first_five(&missing)));
+    }
+    if !unexpected.is_empty() {
+        let list: Vec<String> = unexpected.iter().map(|n| escape(n.as_bytes())).collect();
+        faults.push(format!("{} unexpected: {}", list.len(), first_five(&list)));
+    }
+    if !shapes.is_empty() {
+        faults.push(format!("{} of another shape: {}", shapes.len(), first_five(&shapes)));
+    }
+    if faults.is_empty() {
+        return Ok(from);
+    }
+    let hint = hint(&missing, &unexpected).map_or_else(String::new, |h| format!(" ({h})"));
+    Err(Error::model(escape(at.as_bytes()), format!("tensors do not fit{hint}: {}", faults.join("; "))))
+}
+
+/// What may have gone wrong with the names.
+fn hint(missing: &[String], unexpected: &BTreeSet<&str>) -> Option<String> {
+    let (first, name) = (missing.first()?, unexpected.iter().next()?);
+    // One unknown word in front of every name?
+    if let Some((prefix, _)) = name.split_once('.') {
+        let wrapped = |m: &String| unexpected.contains(format!("{prefix}.{m}").as_str());
+        if missing.iter().all(wrapped) {
+            let shown = escape(prefix.as_bytes());
+            return Some(format!("prefix '{shown}.' is not a known wrapper ({})", WRAPPERS.join(" ")));
+        }
+    }
+    let near = nearest(first, unexpected.iter().copied())?;
+    Some(format!("'{}' may be {first}", escape(near.as_bytes())))
+}
+
+/// The licence of public weights that a checkpoint looks like.
+fn known_licence(names: &Names, specs: &[TensorSpec]) -> Option<String> {
+    if names.vggt {
+        return Some(
+            "names are VGGT's; the public VGGT-1B weights are for non-commercial use (a commercial release exists)"
+                .into(),
+        );
+    }
+    // Parameters of public Pi3.
+    let count: usize = specs.iter().map(TensorSpec::len).sum();
+    let dino = "encoder weights derive from DINOv2 (Apache-2.0)";
+    (count == 958_696_732).then(|| {
+        format!("sizes are those of public Pi3: its weights are CC BY-NC 4.0 (non-commercial), its code BSD-3; {dino}")
+    })
+}
+
+/// Metadata for the blob; hashes the source.
+fn provenance(source: &dyn Checkpoint, options: &Options, report: &mut Report) -> Result<Meta> {
+    let digest = source.digest()?;
+    report.source_digest = Some(digest);
+    let mut meta = Meta::new();
+    meta.set_text(keys::SOURCE_DIGEST, &hex(&digest));
+    meta.set_text(keys::SOURCE, &report.source);
+    meta.set_text(keys::CONVERTER, env!("CARGO_PKG_VERSION"));
+    meta.set_text(keys::PRECISION, options.precision.name());
+    if !options.command.is_empty() {
+        meta.set_text(keys::COMMAND, &options.command);
+    }
+    if let Some(licence) = &report.licence {
+        meta.set_text(keys::LICENCE, licence);
+    }
+    Ok(meta)
+}
+
+/// Reads on one thread, packs and writes on the other; at most two tensors are in memory.
+fn stream(source: &dyn Checkpoint, jobs: &[Job], writer: &mut BlobWriter, report: &mut Report) -> Result<()> {
+    let neutral = Seeded::new(&report.config, 0, Outputs::Neutral)?;
+    let neutral = &neutral;
+    std::thread::scope(|scope| {
+        // A rendezvous: the reader is one tensor ahead. It ends when the writer hangs up.
+        let (send, receive) = sync_channel::<Result<Vec<f32>>>(0);
+        scope.spawn(move || {
+            for job in jobs {
+                let values = load(source, neutral, job);
+                let failed = values.is_err();
+                if send.send(values).is_err() || failed {
+                    return;
+                }
+            }
+        });
+        for (job, row) in jobs.iter().zip(&mut report.tensors) {
+            let values = receive.recv().map_err(|_| Error::Internal("the reading thread ended early".into()))??;
+            row.promoted = job.dtype == Dtype::F16 && !fits_f16(&values);
+            row.dtype = if row.promoted { Dtype::F32 } else { job.dtype };
+            row.zero_outputs = zero_outputs(&job.spec, &values);
+            row.bytes = writer.write(&values, row.dtype)?;
+        }
+        Ok(())
+    })
+}
+
+/// The values of one tensor, all finite.
+fn load(source: &dyn Checkpoint, neutral: &Seeded, job: &Job) -> Result<Vec<f32>> {
+    let mut values = Vec::new();
+    match job.from {
+        (Origin::Checkpoint, index) => source.read_f32(index, &mut values)?,
+        (Origin::Initialised, index) => neutral.read_f32(index, &mut values)?,
+    }
+    if values.len() != job.spec.len() {
+        return Err(Error::Internal(format!("{} values for {} {:?}", values.len(), job.spec.name, job.spec.shape)));
+    }
+    if let Some(first) = values.iter().position(|v| !v.is_finite()) {
+        let count = values.iter().filter(|v| !v.is_finite()).count();
+        return Err(Error::model(
+            &job.spec.name,
+            format!("value {first} is {}; {count} of {} are not finite", values[first], values.len()),
+        ));
+    }
+    Ok(values)
+}
+
+/// Outputs whose weights are all zero.
+fn zero_outputs(spec: &TensorSpec, values: &[f32]) -> usize {
+    match spec.role {
+        Role::Linear | Role::Conv => {
+            values.chunks_exact(values.len() / spec.shape[0]).filter(|w| w.iter().all(|&v| v == 0.0)).count()
+        }
+        _ => 0,
+    }
+}
