@@ -191,7 +191,7 @@ impl Forge {
 
 #[track_caller]
 fn refused(bytes: &[u8], status: i32, text: &str) {
-    let e = Blob::from_bytes(bytes).err().expect("accepted");
+    let e = Blob::from_bytes(bytes).expect_err("accepted");
     assert!(e.status() as i32 == status && e.to_string().contains(text), "status {}: {e}", e.status() as i32);
     assert!(e.line().len() <= 300 && e.line().is_ascii(), "{}", e.line());
 }
@@ -199,7 +199,7 @@ fn refused(bytes: &[u8], status: i32, text: &str) {
 #[track_caller]
 fn refused_file(path: &Path, status: i32, text: &str) {
     for mode in [LoadMode::Map, LoadMode::Copy] {
-        let e = Blob::open(path, mode, Verify::Digests).err().expect("accepted");
+        let e = Blob::open(path, mode, Verify::Digests).expect_err("accepted");
         assert!(e.status() as i32 == status && e.to_string().contains(text), "status {}: {e}", e.status() as i32);
     }
 }
