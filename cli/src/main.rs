@@ -1,1 +1,53 @@
-fn main() {}
+//! The `streetforward` command: thin verbs over the crates beside it.
+//!
+//! | file | what |
+//! |---|---|
+//! | `args.rs` | flag groups and value parsers that verbs share |
+//! | `output.rs` | results, remarks, output folders that appear whole |
+//! | `progress.rs` | progress bars, on a terminal only |
+//! | `exit.rs` | one-line errors, exit codes, caught panics |
+//! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
+//! | `verbs/` | one file per verb |
+#![deny(unsafe_code)]
+
+mod args;
+mod exit;
+mod output;
+mod progress;
+mod signals;
+mod verbs;
+mod views;
+
+use clap::Parser;
+use output::Console;
+use std::process::ExitCode;
+
+/// A clip of street images in, a moving 3D street out, on plain CPU cores.
+///
+/// Results go to standard output, progress and remarks to standard error. Exit codes: 0 done,
+/// 1 a check failed, 2 usage, 3 input, 4 model, 5 resources, 6 reading or writing, 7 unsupported,
+/// 9 integrity, 70 internal, 130 interrupted.
+#[derive(Parser)]
+#[command(name = "streetforward", version, max_term_width = 100)]
+struct Cli {
+    #[command(subcommand)]
+    verb: verbs::Verb,
+    /// Report as one JSON document
+    #[arg(long, global = true)]
+    json: bool,
+    /// No remarks and no progress on standard error
+    #[arg(short, long, global = true)]
+    quiet: bool,
+}
+
+fn main() -> ExitCode {
+    signals::install();
+    let result = exit::guarded(|| match Cli::try_parse() {
+        Ok(cli) => cli.verb.run(&Console::new(cli.json, cli.quiet)),
+        Err(e) => match exit::parsed(&e) {
+            exit::Parsed::Text(text) => output::write_stdout(text.as_bytes()),
+            exit::Parsed::Wrong(e) => Err(e),
+        },
+    });
+    exit::code(&result)
+}

@@ -1,0 +1,38 @@
+//! One file per verb; each has its arguments and a `run` that joins the crates.
+
+mod doctor;
+mod export;
+mod inspect;
+mod render;
+mod verify;
+
+use crate::output::Console;
+use sf_formats::Result;
+
+/// What to do.
+#[derive(clap::Subcommand)]
+pub(crate) enum Verb {
+    /// Draw a scene from new places at new times
+    Render(render::Args),
+    /// Write a scene as files that other tools open
+    Export(export::Args),
+    /// Tell what is in a checkpoint, weight blob, splat file or scene folder
+    Inspect(inspect::Args),
+    /// Check a weight blob: structure and every digest
+    Verify(verify::Args),
+    /// Describe this machine: processor, memory, threads, chosen kernels
+    Doctor(doctor::Args),
+}
+
+impl Verb {
+    /// Does it.
+    pub(crate) fn run(&self, console: &Console) -> Result<()> {
+        match self {
+            Verb::Render(args) => render::run(args, console),
+            Verb::Export(args) => export::run(args, console),
+            Verb::Inspect(args) => inspect::run(args, console),
+            Verb::Verify(args) => verify::run(args, console),
+            Verb::Doctor(args) => doctor::run(args, console),
+        }
+    }
+}

@@ -1,0 +1,83 @@
+//! The process itself: usage errors, exit codes, standard streams.
+
+mod common;
+
+use common::{command, error_line, fails, ok, ok_json, ran, run};
+use std::fs::File;
+use std::process::{Command, Stdio};
+
+#[test]
+fn help_and_version_are_results() {
+    let help = ok(&["--help"]);
+    assert!(help.contains("Usage: streetforward") && help.contains("doctor"), "{help}");
+    assert!(ok(&["doctor", "--help"]).contains("--json"));
+    assert_eq!(ok(&["--version"]), format!("streetforward {}\n", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn wrong_arguments_are_exit_2_and_one_line() {
+    assert!(fails(2, &[] as &[&str]).contains("no command given"));
+    assert!(fails(2, &["docto"]).contains("did you mean 'doctor'?"));
+    assert!(fails(2, &["doctor", "--jsno"]).contains("did you mean '--json'?"));
+    assert!(fails(2, &["doctor", "extra"]).contains("'extra'"));
+    assert!(fails(2, &["doctor", "--json=3"]).contains("--json"));
+    // Raw bytes of the command line do not reach the terminal.
+    fails(2, &["\u{1b}[31mred\nline"]);
+    fails(2, &["x".repeat(5000)]);
+}
+
+#[test]
+fn remarks_go_to_stderr_and_results_to_stdout() {
+    let r = run(&["doctor"]);
+    assert_eq!((r.code, r.stderr.as_str()), (0, ""));
+    assert!(r.stdout.contains("threads"));
+    let json = ok_json(&["doctor"]);
+    assert!(json["allowed_threads"].as_u64().unwrap() >= 1);
+    assert_eq!(json["version"], env!("CARGO_PKG_VERSION"));
+}
+
+#[test]
+fn p08_lost_output_is_exit_6() {
+    // The reader is gone.
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let r = ran(command(&["doctor"]).stdout(writer).output().unwrap());
+    assert_eq!(r.code, 6, "{}", r.stderr);
+    assert!(error_line(&r.stderr).contains("standard output"));
+    // The device is full.
+    if let Ok(full) = File::options().write(true).open("/dev/full") {
+        let r = ran(command(&["doctor", "--json"]).stdout(full).output().unwrap());
+        assert_eq!(r.code, 6, "{}", r.stderr);
+        error_line(&r.stderr);
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn p08_closed_stdout_is_exit_6() {
+    let binary = env!("CARGO_BIN_EXE_streetforward");
+    let script = format!("exec '{binary}' doctor >&-");
+    let r = ran(Command::new("sh").args(["-c", &script]).stdin(Stdio::null()).output().unwrap());
+    assert_eq!(r.code, 6, "{}", r.stderr);
+    assert!(error_line(&r.stderr).contains("closed"));
+    // A closed standard error changes nothing.
+    let script = format!("exec '{binary}' doctor 2>&-");
+    let r = ran(Command::new("sh").args(["-c", &script]).stdin(Stdio::null()).output().unwrap());
+    assert_eq!(r.code, 0);
+}
+
+#[test]
+fn p18_an_instruction_set_that_is_not_here() {
+    let foreign = if cfg!(target_arch = "x86_64") { "neon" } else { "avx2" };
+    let line = fails(7, &["doctor", "--isa", foreign]);
+    assert!(line.contains(foreign) && line.contains("scalar"), "{line}");
+    assert!(fails(2, &["doctor", "--isa", "mmx"]).contains("scalar"));
+    assert_eq!(ok_json(&["doctor", "--isa", "scalar"])["kernels"]["isa"], "scalar");
+    // The environment can only lower, and a value it does not know is not ignored.
+    let with = |value| ran(command(&["doctor", "--json"]).env("STREETFORWARD_CPU", value).output().unwrap());
+    let r = with("scalar");
+    assert!(r.code == 0 && r.stdout.contains("\"isa\": \"scalar\""), "{}", r.stdout);
+    let r = with("warp9");
+    assert_eq!(r.code, 7);
+    assert!(error_line(&r.stderr).contains("STREETFORWARD_CPU"));
+}
