@@ -27,13 +27,10 @@ pub(crate) struct TorchFile {
 /// The status of a reader's fault: the system's, an understood but unsupported content, or a broken
 /// file.
 fn fault(path: &Path, e: &PytorchError) -> Error {
-    let broken = |e: &std::io::Error| {
-        use std::io::ErrorKind::{InvalidData, InvalidInput, Other, UnexpectedEof};
-        matches!(e.kind(), InvalidData | InvalidInput | Other | UnexpectedEof)
-    };
     let why = format!("not a readable PyTorch checkpoint: {}", escape(e.to_string().as_bytes()));
     match e {
-        PytorchError::Io(io) if !broken(io) => Error::io(path, "read", io),
+        // The system's own errors carry a number; the reader's are about the content.
+        PytorchError::Io(io) if io.raw_os_error().is_some() => Error::io(path, "read", io),
         PytorchError::Pickle(PickleError::UnsupportedOpCode(_) | PickleError::UnsupportedType(_)) => {
             Error::unsupported(escape_path(path), why)
         }
