@@ -1,0 +1,313 @@
+//! The order of the network: encoder, alternating attention, camera, depth, intrinsics, Gaussians, motion.
+//!
+//! One file per stage does the work; this one hands them their memory. Stages never overlap in time, so all
+//! of them use the same working area.
+
+use crate::aggregator::{self, Features, Pairs};
+use crate::arena::carve;
+use crate::block::Net;
+use crate::heads::camera::{self, RawCamera};
+use crate::heads::{self, Dense, Source};
+use crate::input::Input;
+use crate::intrinsics::{self, Evidence};
+use crate::model::{DenseHead, Model};
+use crate::output::{Flags, Output};
+use crate::plan::{ClipShape, Plan, trunk_lens};
+use crate::probe::Probe;
+use crate::tables::{DptTables, Tables};
+use crate::unproject::{self, View};
+use crate::{causal, encoder, gaussians, motion};
+use sf_formats::config::{Concat, DepthMap, ModelConfig, MotionLayout};
+use sf_formats::{Pose, Result};
+use sf_ops::activation::exp;
+
+/// Results and small per-frame records of a session.
+pub(crate) struct Memory {
+    pub(crate) output: Output,
+    cameras: Vec<RawCamera>,
+    raw_poses: Vec<Pose>,
+    /// `[frames, 2]`.
+    fov: Vec<f32>,
+    gaussians: Vec<gaussians::Map>,
+    motion: Vec<motion::Map>,
+    views: Vec<View>,
+}
+
+impl Memory {
+    pub(crate) fn new(model: &Model, shape: ClipShape) -> Memory {
+        let n = shape.frames;
+        Memory {
+            output: Output::new(shape, model.config().conf.exists()),
+            cameras: vec![RawCamera::default(); n],
+            raw_poses: vec![Pose::IDENTITY; n],
+            fov: vec![0.0; 2 * n],
+            gaussians: Vec::with_capacity(n),
+            motion: Vec::with_capacity(n),
+            views: Vec::with_capacity(n),
+        }
+    }
+}
+
+/// The arena's areas (see [`Plan`]).
+pub(crate) struct Areas<'a> {
+    /// Kept features.
+    pub(crate) pairs: &'a mut [f32],
+    /// Raw motion maps; empty where the clip or the network has no motion.
+    pub(crate) motion: &'a mut [f32],
+    /// Working memory of the stage in progress.
+    pub(crate) work: &'a mut [f32],
+}
+
+/// One run.
+pub(crate) struct Forward<'a> {
+    pub(crate) net: Net<'a>,
+    pub(crate) config: &'a ModelConfig,
+    pub(crate) plan: &'a Plan,
+    pub(crate) tables: &'a Tables,
+    pub(crate) input: &'a Input<'a>,
+}
+
+impl Forward<'_> {
+    /// The whole network; on success `memory.output` is complete.
+    pub(crate) fn run(&self, areas: Areas, memory: &mut Memory, probe: &mut Probe) -> Result<()> {
+        let d = &self.plan.dims;
+        let Areas { pairs, motion, work } = areas;
+        memory.output.times.copy_from_slice(self.input.times);
+        memory.output.flags = Flags { no_motion: motion.is_empty(), intrinsics_assumed: false };
+        {
+            let [x, tokens, scratch] = carve(work, trunk_lens(self.net.model, d, self.net.ctx.pool.threads()));
+            let to = encoder::Encode { x, tokens, scratch };
+            encoder::run(self.net, d, self.tables, self.input.images, to, probe)?;
+            let to = aggregator::Aggregate { x: tokens, pairs, scratch };
+            aggregator::run(self.net, self.plan, self.tables, self.input.times, to, probe)?;
+        }
+        let pairs = Pairs::new(pairs, self.plan, self.config.aa.dim as usize);
+        self.poses(pairs, work, memory, probe)?;
+        self.depth(pairs, work, &mut memory.output, probe)?;
+        self.confidence(pairs, work, &mut memory.output, probe)?;
+        self.place(memory, probe)?;
+        self.gaussians(pairs, work, memory, probe)?;
+        if !motion.is_empty() {
+            let job = causal::Job { last: pairs.final_pair(), times: self.input.times, raw: motion, scratch: work };
+            causal::run(self.net, (d, self.tables), job, probe)?;
+            self.velocities(motion, memory);
+        }
+        self.show(&memory.output, probe)?;
+        probe.lap("motion");
+        Ok(())
+    }
+
+    /// What camera and linear heads read.
+    fn last<'p>(&self, pairs: Pairs<'p>) -> Features<'p> {
+        match self.config.head_concat {
+            Concat::FrameGlobal => pairs.final_pair(),
+            Concat::Last => pairs.final_pair().last(self.config.aa.dim as usize),
+        }
+    }
+
+    /// Raw poses, then the world's gauge.
+    fn poses(&self, pairs: Pairs, work: &mut [f32], memory: &mut Memory, probe: &mut Probe) -> Result<()> {
+        let d = &self.plan.dims;
+        camera::run(self.net, (d, self.tables), self.last(pairs), work, &mut memory.cameras, probe)?;
+        for (f, raw) in memory.cameras.iter().enumerate() {
+            memory.raw_poses[f] = unproject::raw_pose(&raw.t, &raw.nine);
+            memory.fov[2 * f..2 * f + 2].copy_from_slice(&raw.fov);
+            let rows = memory.raw_poses[f].to_rows().map(|r| r.map(|v| v as f32));
+            probe.emit(format_args!("pose"), Some(f), &[4, 4], rows.as_flattened());
+        }
+        unproject::anchor(self.config, &memory.raw_poses, &mut memory.output.poses);
+        probe.lap("camera");
+        Ok(())
+    }
+
+    /// A dense head on the aggregator and what it reads.
+    fn dense<'p>(&'p self, name: &'static str, head: &'p DenseHead, pairs: Pairs<'p>) -> (Dense<'p>, Source<'p>) {
+        let tables: Option<&DptTables> = match name {
+            "depth" => self.tables.depth.as_ref(),
+            "conf" => self.tables.conf.as_ref(),
+            _ => self.tables.gs.as_ref(),
+        };
+        let source = match head {
+            DenseHead::Linear(_) => Source::Tokens(self.last(pairs)),
+            DenseHead::Dpt(dpt) => Source::Taps(dpt.taps.map(|t| pairs.get(t))),
+        };
+        let dense = Dense { net: self.net, dims: &self.plan.dims, tables: self.tables, dpt: tables, head, name };
+        (dense, source)
+    }
+
+    /// Local points and depth, in the network's units until [`Forward::place`].
+    fn depth(&self, pairs: Pairs, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
+        let d = &self.plan.dims;
+        let (dense, source) = self.dense("depth", &self.net.model.weights().depth, pairs);
+        dense.prepare(source, work, probe)?;
+        let pool = self.net.ctx.pool;
+        for f in 0..d.frames {
+            let pixels = f * d.pixels()..(f + 1) * d.pixels();
+            let depth = &mut out.depth[pixels.clone()];
+            match self.config.depth_map {
+                DepthMap::Pi3Point => {
+                    let points = &mut out.points[pixels];
+                    dense.frame(source, f, work, points.as_flattened_mut());
+                    pool.chunks(points, d.width, &|_, row, _| {
+                        for p in row {
+                            let z = exp(p[2]);
+                            *p = [p[0] * z, p[1] * z, z];
+                        }
+                    });
+                    depth.iter_mut().zip(&*points).for_each(|(z, p)| *z = p[2]);
+                    probe.guard(format_args!("depth"), points.as_flattened())?;
+                    probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 3], points.as_flattened());
+                }
+                DepthMap::ExpZ => {
+                    dense.frame(source, f, work, depth);
+                    pool.chunks(depth, d.width, &|_, row, _| row.iter_mut().for_each(|z| *z = exp(*z)));
+                    probe.guard(format_args!("depth"), depth)?;
+                    probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 1], depth);
+                }
+            }
+        }
+        probe.lap("depth");
+        Ok(())
+    }
+
+    fn confidence(&self, pairs: Pairs, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
+        let d = &self.plan.dims;
+        if let Some(head) = &self.net.model.weights().conf {
+            let (dense, source) = self.dense("conf", head, pairs);
+            dense.prepare(source, work, probe)?;
+            for (f, conf) in out.conf.chunks_exact_mut(d.pixels()).enumerate() {
+                dense.frame(source, f, work, conf);
+                probe.guard(format_args!("conf"), conf)?;
+                probe.emit(format_args!("conf"), Some(f), &[d.height, d.width], conf);
+            }
+        }
+        probe.lap("conf");
+        Ok(())
+    }
+
+    /// Intrinsics; then everything in scene units, and the centres.
+    fn place(&self, memory: &mut Memory, probe: &mut Probe) -> Result<()> {
+        let (c, d) = (self.config, &self.plan.dims);
+        let Memory { output: out, fov, views, gaussians, motion, .. } = memory;
+        let points = (c.depth_map == DepthMap::Pi3Point).then(|| out.points.as_flattened());
+        let evidence = Evidence { user: self.input.k, fov: Some(fov), points };
+        out.flags.intrinsics_assumed = !intrinsics::choose(c, d, evidence, &mut out.k);
+        for (f, k) in out.k.iter().enumerate() {
+            probe.emit(format_args!("k"), Some(f), &[4], &[k.fx, k.fy, k.cx, k.cy].map(|v| v as f32));
+        }
+        views.clear();
+        views.extend(out.poses.iter().zip(&out.k).map(|(&pose, &k)| View { pose, k, pixel: c.camera_pixel }));
+        gaussians.clear();
+        gaussians.extend(views.iter().map(|view| gaussians::Map::new(c, view)));
+        motion.clear();
+        motion.extend(views.iter().enumerate().map(|(f, v)| motion::Map::new(c, self.input.times, f, v.rotation())));
+
+        let scale = c.world_scale as f32;
+        out.depth.iter_mut().for_each(|z| *z *= scale);
+        out.points.as_flattened_mut().iter_mut().for_each(|p| *p *= scale);
+        let (pool, depth) = (self.net.ctx.pool, &out.depth);
+        pool.chunks(&mut out.mean, d.width, &|row, mean, _| {
+            views[row / d.height].mean_row(row % d.height, &depth[row * d.width..][..d.width], mean);
+        });
+        if c.depth_map == DepthMap::ExpZ {
+            pool.chunks(&mut out.points, d.width, &|row, points, _| {
+                let depth = &depth[row * d.width..][..d.width];
+                for (u, (p, &z)) in points.iter_mut().zip(depth).enumerate() {
+                    let local = views[row / d.height].local(u, row % d.height, z);
+                    *p = [local.x as f32, local.y as f32, local.z as f32];
+                }
+            });
+        }
+        probe.guard(format_args!("centres"), out.mean.as_flattened())?;
+        probe.lap("depth");
+        Ok(())
+    }
+
+    fn gaussians(&self, pairs: Pairs, work: &mut [f32], memory: &mut Memory, probe: &mut Probe) -> Result<()> {
+        let d = &self.plan.dims;
+        let Some(head) = &self.net.model.weights().gs else {
+            for f in 0..d.frames {
+                self.map_gaussians(f, None, memory);
+            }
+            probe.lap("gaussians");
+            return Ok(());
+        };
+        let (dense, source) = self.dense("gs", head, pairs);
+        let need = heads::scratch_len(head, d, d.tokens, self.net.ctx.pool.threads());
+        let [raw, work] = carve(work, [d.pixels() * gaussians::CHANNELS, need]);
+        dense.prepare(source, work, probe)?;
+        for f in 0..d.frames {
+            dense.frame(source, f, work, raw);
+            probe.guard(format_args!("gs"), raw)?;
+            probe.emit(format_args!("gs.raw"), Some(f), &[d.height, d.width, gaussians::CHANNELS], raw);
+            self.map_gaussians(f, Some(raw), memory);
+        }
+        probe.lap("gaussians");
+        Ok(())
+    }
+
+    /// Activations of one frame; `raw` is its `[height, width, 11]`, or priors are used.
+    fn map_gaussians(&self, f: usize, raw: Option<&[f32]>, memory: &mut Memory) {
+        let d = &self.plan.dims;
+        let (w, pixels) = (d.width, f * d.pixels()..(f + 1) * d.pixels());
+        let (out, map, pool) = (&mut memory.output, &memory.gaussians[f], self.net.ctx.pool);
+        let conf = (!out.conf.is_empty()).then(|| &out.conf[pixels.clone()]);
+        let row = |v: usize| match raw {
+            Some(raw) => gaussians::Raw::Head(&raw[v * w * gaussians::CHANNELS..][..w * gaussians::CHANNELS]),
+            None => gaussians::Raw::Priors(conf.map(|c| &c[v * w..][..w])),
+        };
+        let (image, depth) = (self.input.frame(f), &out.depth[pixels.clone()]);
+        pool.chunks(&mut out.scale[pixels.clone()], w, &|v, s, _| map.scale_row(row(v), &depth[v * w..][..w], s));
+        pool.chunks(&mut out.quat[pixels.clone()], w, &|v, q, _| map.quat_row(row(v), q));
+        pool.chunks(&mut out.opacity[pixels.clone()], w, &|v, o, _| map.opacity_row(row(v), o));
+        pool.chunks(&mut out.colour[pixels], w, &|v, c, _| map.colour_row(row(v), &image[3 * v * w..][..3 * w], c));
+    }
+
+    /// Velocities and dynamic probabilities from the raw maps of the passes.
+    fn velocities(&self, raw: &[f32], memory: &mut Memory) {
+        let (c, d) = (self.config, &self.plan.dims);
+        let (w, channels) = (d.width, c.motion.out as usize);
+        let (fwd, bwd) = match c.motion_layout {
+            MotionLayout::PerDirection => raw.split_at(raw.len() / 2),
+            MotionLayout::SinglePass => (raw, &raw[..0]),
+        };
+        let row = |r: usize| {
+            let part = |map: &'_ [f32]| r * w * channels..(r * w * channels + w * channels).min(map.len());
+            match c.motion_layout {
+                MotionLayout::PerDirection => motion::Raw::Passes(&fwd[part(fwd)], &bwd[part(bwd)]),
+                MotionLayout::SinglePass => motion::Raw::Single(&fwd[part(fwd)]),
+            }
+        };
+        let (out, maps, pool) = (&mut memory.output, &memory.motion, self.net.ctx.pool);
+        pool.chunks(&mut out.v_fwd, w, &|r, v, _| maps[r / d.height].forward_row(row(r), v));
+        pool.chunks(&mut out.v_bwd, w, &|r, v, _| maps[r / d.height].backward_row(row(r), v));
+        pool.chunks(&mut out.dynamic, w, &|r, p, _| maps[r / d.height].dynamic_row(row(r), p));
+    }
+
+    /// The last guard, and the outputs as stages.
+    fn show(&self, out: &Output, probe: &mut Probe) -> Result<()> {
+        let d = &self.plan.dims;
+        let (size, vectors) = ([d.frames, d.height, d.width], [d.frames, d.height, d.width, 3]);
+        let quats = [d.frames, d.height, d.width, 4];
+        let planes: [(&str, &[usize], &[f32]); 9] = [
+            ("out.depth", &size, &out.depth),
+            ("out.mean", &vectors, out.mean.as_flattened()),
+            ("out.scale", &vectors, out.scale.as_flattened()),
+            ("out.quat", &quats, out.quat.as_flattened()),
+            ("out.opacity", &size, &out.opacity),
+            ("out.colour", &vectors, out.colour.as_flattened()),
+            ("out.v_fwd", &vectors, out.v_fwd.as_flattened()),
+            ("out.v_bwd", &vectors, out.v_bwd.as_flattened()),
+            ("out.dynamic", &size, &out.dynamic),
+        ];
+        for (f, pose) in out.poses.iter().enumerate() {
+            let rows = pose.to_rows().map(|r| r.map(|v| v as f32));
+            probe.emit(format_args!("out.pose"), Some(f), &[4, 4], rows.as_flattened());
+        }
+        for (name, shape, data) in planes {
+            probe.guard(format_args!("{name}"), data)?;
+            probe.emit(format_args!("{name}"), None, shape, data);
+        }
+        Ok(())
+    }
+}

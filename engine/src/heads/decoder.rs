@@ -1,0 +1,68 @@
+//! Pi3's transformer decoder: projection, frame-local blocks with rotary positions, projection (network
+//! specification 1.3, step 8). No layer scale, no q/k norms.
+
+use crate::aggregator::Features;
+use crate::arena::{carve, carved_len};
+use crate::block::{self, BlockShape, Net, Sight};
+use crate::model::Decoder;
+use crate::plan::Dims;
+use crate::probe::Probe;
+use crate::tables::{Tables, Tokens};
+use sf_formats::Result;
+use sf_ops::gemm::Act;
+use sf_ops::mat::{Mat, MatMut};
+
+/// Tokens, block scratch.
+fn lens(decoder: &Decoder, d: &Dims, tokens: usize, threads: usize) -> [usize; 2] {
+    let mask = d.frame_mask(tokens);
+    let blocks = decoder.blocks.iter().map(|b| BlockShape::of(b, threads).scratch_len(&mask)).max();
+    [d.frames * tokens * decoder.projects.weight.n, blocks.unwrap_or(0)]
+}
+
+pub(crate) fn scratch_len(decoder: &Decoder, d: &Dims, tokens: usize, threads: usize) -> usize {
+    carved_len(lens(decoder, d, tokens, threads))
+}
+
+/// Which tokens of the features take part.
+#[derive(Clone, Copy)]
+pub(crate) struct Job<'a> {
+    pub(crate) name: &'static str,
+    pub(crate) x: Features<'a>,
+    pub(crate) tokens: Tokens,
+}
+
+/// Runs the decoder; `out` receives `[frames, tokens, linear_out]`, registers included where they take
+/// part.
+pub(crate) fn run(
+    net: Net,
+    decoder: &Decoder,
+    (d, tables): (&Dims, &Tables),
+    job: Job,
+    (scratch, out): (&mut [f32], &mut [f32]),
+    probe: &Probe,
+) -> Result<()> {
+    let per_frame = match job.tokens {
+        Tokens::WithRegisters => job.x.tokens(),
+        Tokens::Patches => d.patches,
+    };
+    let dim = decoder.projects.weight.n;
+    let rows = d.frames * per_frame;
+    let [x, scratch] = carve(scratch, lens(decoder, d, per_frame, net.ctx.pool.threads()));
+    match job.tokens {
+        Tokens::WithRegisters => net.linear(&decoder.projects, Act::None, job.x.all(), MatMut::new(x, rows, dim)),
+        Tokens::Patches => {
+            for (f, frame) in x.chunks_exact_mut(per_frame * dim).enumerate() {
+                net.linear(&decoder.projects, Act::None, job.x.patches(f), MatMut::new(frame, per_frame, dim));
+            }
+        }
+    }
+    let mask = d.frame_mask(per_frame);
+    for (j, weights) in decoder.blocks.iter().enumerate() {
+        let rope = tables.rope(dim / weights.heads, job.tokens);
+        block::forward(net, weights, x, Sight { mask, rope: Some(rope) }, scratch);
+        probe.guard(format_args!("{}.{j}", job.name), x)?;
+    }
+    let width = decoder.linear_out.weight.n;
+    net.linear(&decoder.linear_out, Act::None, Mat::new(x, rows, dim), MatMut::new(out, rows, width));
+    Ok(())
+}

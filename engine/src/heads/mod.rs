@@ -1,0 +1,82 @@
+//! Dense heads and the camera head.
+//!
+//! | file | what |
+//! |---|---|
+//! | `decoder.rs` | Pi3's transformer decoder, shared by the camera and the linear heads |
+//! | `linear.rs` | one linear layer and a pixel shuffle |
+//! | `dpt.rs` | VGGT's convolutional pyramid over four taps |
+//! | `camera.rs` | pose and field of view |
+//!
+//! A dense head works in two steps: [`prepare`] runs what wants all frames at once (a decoder), [`frame`]
+//! gives one frame's raw map. Only one frame's pyramid is ever in memory.
+
+pub(crate) mod camera;
+pub(crate) mod decoder;
+pub(crate) mod dpt;
+pub(crate) mod linear;
+
+use crate::aggregator::Features;
+use crate::block::Net;
+use crate::model::DenseHead;
+use crate::plan::Dims;
+use crate::probe::Probe;
+use crate::tables::{DptTables, Tables};
+use sf_formats::Result;
+
+/// What a dense head reads.
+#[derive(Clone, Copy)]
+pub(crate) enum Source<'a> {
+    /// One tensor, for a decoder.
+    Tokens(Features<'a>),
+    /// Four taps, for a pyramid.
+    Taps([Features<'a>; 4]),
+}
+
+/// A dense head at work on a clip.
+pub(crate) struct Dense<'a> {
+    pub(crate) net: Net<'a>,
+    pub(crate) dims: &'a Dims,
+    pub(crate) tables: &'a Tables,
+    pub(crate) dpt: Option<&'a DptTables>,
+    pub(crate) head: &'a DenseHead,
+    pub(crate) name: &'static str,
+}
+
+impl Dense<'_> {
+    /// The part over all frames; its result stays at the start of `scratch` for [`Dense::frame`].
+    pub(crate) fn prepare(&self, source: Source, scratch: &mut [f32], probe: &mut Probe) -> Result<()> {
+        match (self.head, source) {
+            (DenseHead::Linear(head), Source::Tokens(x)) => linear::prepare(self, head, x, scratch, probe),
+            (DenseHead::Dpt(_), Source::Taps(_)) => Ok(()),
+            _ => unreachable!("the source is chosen by the kind of the head"),
+        }
+    }
+
+    /// The raw map of one frame, `[height, width, channels]`.
+    pub(crate) fn frame(&self, source: Source, frame: usize, scratch: &mut [f32], out: &mut [f32]) {
+        match (self.head, source) {
+            (DenseHead::Linear(head), Source::Tokens(x)) => linear::frame(self, head, x, (frame, scratch, out)),
+            (DenseHead::Dpt(head), Source::Taps(taps)) => {
+                let tables = self.dpt.expect("a pyramid has its position tables");
+                dpt::frame(self.net, head, tables, self.dims, dpt::Pyramid { taps, frame, scratch, out });
+            }
+            _ => unreachable!("the source is chosen by the kind of the head"),
+        }
+    }
+}
+
+/// Channels of the raw map.
+pub(crate) fn channels(head: &DenseHead) -> usize {
+    match head {
+        DenseHead::Linear(h) => h.out,
+        DenseHead::Dpt(h) => h.out,
+    }
+}
+
+/// Values of working memory of a dense head over `tokens` tokens per frame.
+pub(crate) fn scratch_len(head: &DenseHead, dims: &Dims, tokens: usize, threads: usize) -> usize {
+    match head {
+        DenseHead::Linear(h) => linear::scratch_len(h, dims, tokens, threads),
+        DenseHead::Dpt(h) => dpt::scratch_len(h, dims),
+    }
+}

@@ -1,0 +1,441 @@
+//! [`Model`]: a blob and the typed handles of every weight in it.
+//!
+//! Names and shapes are resolved here and nowhere else; afterwards a weight is a handle that cannot
+//! miss. Handles hold positions, not borrows, so a `Model` is owned, `Send + Sync`, and shared by any
+//! number of sessions.
+
+use sf_formats::blob::{Blob, Dtype, LoadMode, Verify};
+use sf_formats::config::{Head, HeadKind, KSource, ModelConfig, RcuSkip, Trunk};
+use sf_formats::{Error, Result};
+use sf_ops::gemm::{PanelData, Panels};
+use std::path::Path;
+
+/// A matrix in panels, `[n, k]`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PanelRef {
+    tensor: usize,
+    half: bool,
+    /// Outputs.
+    pub(crate) n: usize,
+    /// Inputs.
+    pub(crate) k: usize,
+}
+
+/// A vector or table in f32.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct VecRef(usize);
+
+/// A matrix with its bias: linear layers and convolutions.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Linear {
+    pub(crate) weight: PanelRef,
+    pub(crate) bias: Option<VecRef>,
+}
+
+/// A layer norm.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Norm {
+    pub(crate) gain: VecRef,
+    pub(crate) offset: VecRef,
+    pub(crate) eps: f32,
+}
+
+/// One transformer block.
+#[derive(Clone, Debug)]
+pub(crate) struct Block {
+    pub(crate) dim: usize,
+    pub(crate) heads: usize,
+    pub(crate) hidden: usize,
+    pub(crate) norm1: Norm,
+    pub(crate) qkv: Linear, // [3 dim, dim]
+    /// Per-head query and key norms, `dim / heads` wide.
+    pub(crate) qk: Option<(Norm, Norm)>,
+    pub(crate) proj: Linear, // [dim, dim]
+    pub(crate) ls1: Option<VecRef>,
+    pub(crate) norm2: Norm,
+    pub(crate) fc1: Linear, // [hidden, dim]
+    pub(crate) fc2: Linear, // [dim, hidden]
+    pub(crate) ls2: Option<VecRef>,
+}
+
+/// Pi3's decoder: projection, blocks, projection.
+#[derive(Clone, Debug)]
+pub(crate) struct Decoder {
+    pub(crate) projects: Linear,
+    pub(crate) blocks: Vec<Block>,
+    pub(crate) linear_out: Linear,
+}
+
+/// A residual unit of a DPT pyramid: two 3x3 convolutions.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Unit {
+    pub(crate) conv1: Linear,
+    pub(crate) conv2: Linear,
+}
+
+/// One fusion level of a DPT pyramid.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Fusion {
+    /// On the level's own features; the coarsest level has none.
+    pub(crate) lateral: Option<Unit>,
+    pub(crate) unit: Unit,
+    pub(crate) out: Linear,
+}
+
+/// VGGT's convolutional head over four taps.
+#[derive(Clone, Debug)]
+pub(crate) struct Dpt {
+    pub(crate) taps: [usize; 4],
+    pub(crate) channels: [usize; 4],
+    pub(crate) features: usize,
+    pub(crate) hidden: usize,
+    pub(crate) out: usize,
+    pub(crate) skip: RcuSkip,
+    pub(crate) norm: Norm,
+    pub(crate) projects: [Linear; 4],
+    pub(crate) up4: Linear,
+    pub(crate) up2: Linear,
+    pub(crate) down2: Linear,
+    pub(crate) lateral: [Linear; 4],
+    /// Finest first, as the tensors are named: `refinenet1` to `refinenet4`.
+    pub(crate) fusion: [Fusion; 4],
+    pub(crate) output1: Linear,
+    pub(crate) output2: Linear,
+    pub(crate) last: Linear,
+}
+
+/// Transformer decoder, linear layer, pixel shuffle.
+#[derive(Clone, Debug)]
+pub(crate) struct LinearHead {
+    pub(crate) decoder: Decoder,
+    pub(crate) proj: Linear, // [out patch^2, dim]
+    pub(crate) out: usize,
+}
+
+/// A dense head.
+#[derive(Clone, Debug)]
+pub(crate) enum DenseHead {
+    Linear(LinearHead),
+    Dpt(Box<Dpt>),
+}
+
+/// The camera decoder and head.
+#[derive(Clone, Debug)]
+pub(crate) struct Camera {
+    pub(crate) decoder: Decoder,
+    pub(crate) units: [[Linear; 3]; 2],
+    pub(crate) mlps: [Linear; 2],
+    pub(crate) t: Linear,
+    pub(crate) rot: Linear,
+    pub(crate) fov: Option<Linear>,
+}
+
+/// Every weight of the network.
+#[derive(Clone, Debug)]
+pub(crate) struct Weights {
+    pub(crate) patch: Linear,             // [dim, patch^2 3], k = [ky][kx][rgb]
+    pub(crate) cls: VecRef,               // [dim]
+    pub(crate) positions: VecRef,         // [1 + grid^2, dim]
+    pub(crate) registers: Option<VecRef>, // [encoder registers, dim]
+    pub(crate) encoder: Vec<Block>,
+    pub(crate) encoder_norm: Norm,
+    pub(crate) aa_registers: Option<VecRef>, // [aa registers, dim]
+    pub(crate) aa_time: Option<Linear>,      // [dim, d_t]
+    pub(crate) aa: Vec<Block>,
+    pub(crate) camera: Camera,
+    pub(crate) depth: DenseHead,
+    pub(crate) conf: Option<DenseHead>,
+    pub(crate) gs: Option<DenseHead>,
+    pub(crate) causal: Vec<Block>,
+    /// The backward pass's own set, where the passes do not share.
+    pub(crate) causal_back: Option<Vec<Block>>,
+    pub(crate) motion: Option<DenseHead>,
+}
+
+/// A network ready to run: weights and configuration, immutable.
+///
+/// ```no_run
+/// # fn main() -> sf_formats::Result<()> {
+/// use sf_formats::blob::LoadMode;
+/// let model = streetforward::Model::open("nano.sfw".as_ref(), LoadMode::Map)?;
+/// println!("{} parameters", model.parameters());
+/// # Ok(())
+/// # }
+/// ```
+#[derive(Debug)]
+pub struct Model {
+    blob: Blob,
+    weights: Weights,
+}
+
+impl Model {
+    /// Opens a `.sfw` file, every tensor's digest verified.
+    pub fn open(path: &Path, mode: LoadMode) -> Result<Model> {
+        Self::from_blob(Blob::open(path, mode, Verify::Digests)?)
+    }
+
+    /// From an opened blob.
+    pub fn from_blob(blob: Blob) -> Result<Model> {
+        let config = blob.config().clone();
+        config.check("model")?;
+        let weights = Lookup { blob: &blob, config: &config }.weights()?;
+        Ok(Model { blob, weights })
+    }
+
+    /// Sizes and conventions.
+    pub fn config(&self) -> &ModelConfig {
+        self.blob.config()
+    }
+
+    /// The file behind it.
+    pub fn blob(&self) -> &Blob {
+        &self.blob
+    }
+
+    /// Number of parameters.
+    pub fn parameters(&self) -> usize {
+        sf_formats::arch::parameters(self.config())
+    }
+
+    pub(crate) fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// The panels behind a handle.
+    pub(crate) fn panels(&self, r: &PanelRef) -> Panels<'_> {
+        let data =
+            if r.half { PanelData::F16(self.blob.f16s(r.tensor)) } else { PanelData::F32(self.blob.f32s(r.tensor)) };
+        Panels { n: r.n, k: r.k, data }
+    }
+
+    /// The values behind a handle.
+    pub(crate) fn values(&self, r: VecRef) -> &[f32] {
+        self.blob.f32s(r.0)
+    }
+}
+
+struct Lookup<'a> {
+    blob: &'a Blob,
+    config: &'a ModelConfig,
+}
+
+impl Lookup<'_> {
+    fn find(&self, name: &str) -> Result<usize> {
+        self.blob.find(name).ok_or_else(|| Error::model(name, "tensor is missing: convert the checkpoint again"))
+    }
+
+    fn panels(&self, name: &str, n: usize, k: usize) -> Result<PanelRef> {
+        let tensor = self.find(name)?;
+        let record = &self.blob.tensors()[tensor];
+        let half = record.dtype == Dtype::F16;
+        let have = if half { self.blob.f16s(tensor).len() } else { self.blob.f32s(tensor).len() };
+        let need = sf_ops::gemm::panel_len(n, k);
+        if have != need {
+            return Err(Error::model(name, format!("{have} values in panels, {n} x {k} needs {need}")));
+        }
+        Ok(PanelRef { tensor, half, n, k })
+    }
+
+    fn values(&self, name: &str, len: usize) -> Result<VecRef> {
+        let tensor = self.find(name)?;
+        let record = &self.blob.tensors()[tensor];
+        if record.dtype != Dtype::F32 || self.blob.f32s(tensor).len() != len {
+            return Err(Error::model(name, format!("must be {len} values of f32")));
+        }
+        Ok(VecRef(tensor))
+    }
+
+    fn linear(&self, name: &str, n: usize, k: usize) -> Result<Linear> {
+        let weight = self.panels(&format!("{name}.weight"), n, k)?;
+        Ok(Linear { weight, bias: Some(self.values(&format!("{name}.bias"), n)?) })
+    }
+
+    fn conv(&self, name: &str, out: usize, inputs: usize, kernel: usize) -> Result<Linear> {
+        self.linear(name, out, kernel * kernel * inputs)
+    }
+
+    fn norm(&self, name: &str, dim: usize, eps: f64) -> Result<Norm> {
+        let gain = self.values(&format!("{name}.weight"), dim)?;
+        Ok(Norm { gain, offset: self.values(&format!("{name}.bias"), dim)?, eps: eps as f32 })
+    }
+
+    fn block(&self, p: &str, t: &Trunk, kind: BlockKind) -> Result<Block> {
+        let (dim, heads) = (t.dim as usize, t.heads as usize);
+        let hidden = dim * t.mlp_ratio as usize;
+        let norm = |name: &str| self.norm(&format!("{p}.{name}"), dim, t.eps);
+        let scale = |name: &str| match kind {
+            BlockKind::Decoder => Ok(None),
+            _ => self.values(&format!("{p}.{name}.gamma"), dim).map(Some),
+        };
+        let qk = match kind {
+            BlockKind::Aa => {
+                let part = |name: &str| self.norm(&format!("{p}.attn.{name}"), dim / heads, self.config.qk_eps);
+                Some((part("q_norm")?, part("k_norm")?))
+            }
+            _ => None,
+        };
+        Ok(Block {
+            dim,
+            heads,
+            hidden,
+            norm1: norm("norm1")?,
+            qkv: self.linear(&format!("{p}.attn.qkv"), 3 * dim, dim)?,
+            qk,
+            proj: self.linear(&format!("{p}.attn.proj"), dim, dim)?,
+            ls1: scale("ls1")?,
+            norm2: norm("norm2")?,
+            fc1: self.linear(&format!("{p}.mlp.fc1"), hidden, dim)?,
+            fc2: self.linear(&format!("{p}.mlp.fc2"), dim, hidden)?,
+            ls2: scale("ls2")?,
+        })
+    }
+
+    fn trunk(&self, p: &str, t: &Trunk, kind: BlockKind) -> Result<Vec<Block>> {
+        (0..t.depth).map(|i| self.block(&format!("{p}.{i}"), t, kind)).collect()
+    }
+
+    fn decoder(&self, p: &str, inputs: usize, t: &Trunk, out: usize) -> Result<Decoder> {
+        Ok(Decoder {
+            projects: self.linear(&format!("{p}.projects"), t.dim as usize, inputs)?,
+            blocks: self.trunk(&format!("{p}.blocks"), t, BlockKind::Decoder)?,
+            linear_out: self.linear(&format!("{p}.linear_out"), out, t.dim as usize)?,
+        })
+    }
+
+    fn dpt(&self, p: &str, inputs: usize, h: &Head) -> Result<Dpt> {
+        let list = |l: &[u32]| -> [usize; 4] { std::array::from_fn(|i| l[i] as usize) };
+        let (channels, f) = (list(&h.channels), h.features as usize);
+        let s = format!("{p}.scratch");
+        let unit = |name: String| -> Result<Unit> {
+            let conv1 = self.conv(&format!("{name}.conv1"), f, f, 3)?;
+            Ok(Unit { conv1, conv2: self.conv(&format!("{name}.conv2"), f, f, 3)? })
+        };
+        let fusion = |i: usize| -> Result<Fusion> {
+            let r = format!("{s}.refinenet{i}");
+            Ok(Fusion {
+                lateral: if i == 4 { None } else { Some(unit(format!("{r}.resConfUnit1"))?) },
+                unit: unit(format!("{r}.resConfUnit2"))?,
+                out: self.conv(&format!("{r}.out_conv"), f, f, 1)?,
+            })
+        };
+        let project = |i: usize| self.conv(&format!("{p}.projects.{i}"), channels[i], inputs, 1);
+        let lateral = |i: usize| -> Result<Linear> {
+            let weight = self.panels(&format!("{s}.layer{}_rn.weight", i + 1), f, 9 * channels[i])?;
+            Ok(Linear { weight, bias: None })
+        };
+        let up = |i: usize, k: usize| -> Result<Linear> {
+            let c = channels[i];
+            let weight = self.panels(&format!("{p}.resize_layers.{i}.weight"), k * k * c, c)?;
+            Ok(Linear { weight, bias: Some(self.values(&format!("{p}.resize_layers.{i}.bias"), c)?) })
+        };
+        let (hidden, out) = (h.hidden as usize, h.out as usize);
+        Ok(Dpt {
+            taps: list(&h.taps),
+            channels,
+            features: f,
+            hidden,
+            out,
+            skip: h.rcu_skip,
+            norm: self.norm(&format!("{p}.norm"), inputs, h.eps)?,
+            projects: [project(0)?, project(1)?, project(2)?, project(3)?],
+            up4: up(0, 4)?,
+            up2: up(1, 2)?,
+            down2: self.conv(&format!("{p}.resize_layers.3"), channels[3], channels[3], 3)?,
+            lateral: [lateral(0)?, lateral(1)?, lateral(2)?, lateral(3)?],
+            fusion: [fusion(1)?, fusion(2)?, fusion(3)?, fusion(4)?],
+            output1: self.conv(&format!("{s}.output_conv1"), f / 2, f, 3)?,
+            output2: self.conv(&format!("{s}.output_conv2.0"), hidden, f / 2, 3)?,
+            last: self.conv(&format!("{s}.output_conv2.2"), out, hidden, 1)?,
+        })
+    }
+
+    /// `inputs` are the features of an `xdec_linear` head, `taps` those of a DPT head.
+    fn head(&self, name: &str, inputs: usize, taps: usize, h: &Head) -> Result<Option<DenseHead>> {
+        Ok(match h.kind {
+            HeadKind::None | HeadKind::XdecConv => None,
+            HeadKind::XdecLinear => {
+                let t = decoder_trunk(h.dim, h.depth, h.heads, h.eps);
+                let area = (self.config.patch * self.config.patch) as usize;
+                Some(DenseHead::Linear(LinearHead {
+                    decoder: self.decoder(&format!("{name}_decoder"), inputs, &t, h.dim as usize)?,
+                    proj: self.linear(&format!("{name}_head.proj"), area * h.out as usize, h.dim as usize)?,
+                    out: h.out as usize,
+                }))
+            }
+            HeadKind::Dpt => Some(DenseHead::Dpt(Box::new(self.dpt(&format!("{name}_head"), taps, h)?))),
+        })
+    }
+
+    fn camera(&self) -> Result<Camera> {
+        let c = self.config;
+        let t = decoder_trunk(c.camera_dim, c.camera_depth, c.camera_heads, c.aa.eps);
+        let w = c.camera_width as usize;
+        let unit = |u: usize, i: usize| self.linear(&format!("camera_head.res_conv.{u}.res_conv{i}"), w, w);
+        Ok(Camera {
+            decoder: self.decoder("camera_decoder", c.head_in() as usize, &t, w)?,
+            units: [[unit(0, 1)?, unit(0, 2)?, unit(0, 3)?], [unit(1, 1)?, unit(1, 2)?, unit(1, 3)?]],
+            mlps: [self.linear("camera_head.more_mlps.0", w, w)?, self.linear("camera_head.more_mlps.2", w, w)?],
+            t: self.linear("camera_head.fc_t", 3, w)?,
+            rot: self.linear("camera_head.fc_rot", 9, w)?,
+            fov: if c.camera_k == KSource::Fov { Some(self.linear("camera_head.fc_fov", 2, w)?) } else { None },
+        })
+    }
+
+    fn weights(&self) -> Result<Weights> {
+        let c = self.config;
+        let (dim, patch, grid) = (c.encoder.dim as usize, c.patch as usize, c.pos_grid as usize);
+        let tokens = |name: &str, count: u32| match count {
+            0 => Ok(None),
+            n => self.values(name, n as usize * dim).map(Some),
+        };
+        let (inputs, pair) = (c.head_in() as usize, 2 * c.aa.dim as usize);
+        let causal_trunk = Trunk {
+            dim: c.causal_dim(),
+            depth: c.causal_depth,
+            heads: c.causal_heads,
+            registers: 0,
+            mlp_ratio: 4,
+            eps: c.aa.eps,
+        };
+        let causal_dim = c.causal_dim() as usize;
+        let need = |head: Option<DenseHead>| head.ok_or_else(|| Error::model("depth", "the depth head is missing"));
+        Ok(Weights {
+            patch: self.conv("encoder.patch_embed.proj", dim, 3, patch)?,
+            cls: self.values("encoder.cls_token", dim)?,
+            positions: self.values("encoder.pos_embed", (1 + grid * grid) * dim)?,
+            registers: tokens("encoder.register_tokens", c.encoder.registers)?,
+            encoder: self.trunk("encoder.blocks", &c.encoder, BlockKind::Encoder)?,
+            encoder_norm: self.norm("encoder.norm", dim, c.encoder.eps)?,
+            aa_registers: tokens("register_token", c.aa.registers)?,
+            aa_time: if c.aa_time { Some(self.linear("aa_time", dim, c.time_dim as usize)?) } else { None },
+            aa: self.trunk("decoder", &c.aa, BlockKind::Aa)?,
+            camera: self.camera()?,
+            depth: need(self.head("point", inputs, pair, &c.depth)?)?,
+            conf: self.head("conf", inputs, pair, &c.conf)?,
+            gs: self.head("gs", inputs, pair, &c.gs)?,
+            causal: self.trunk("causal", &causal_trunk, BlockKind::Aa)?,
+            causal_back: if c.causal_share || c.causal_depth == 0 {
+                None
+            } else {
+                Some(self.trunk("causal_back", &causal_trunk, BlockKind::Aa)?)
+            },
+            motion: self.head("motion", causal_dim, causal_dim, &c.motion)?,
+        })
+    }
+}
+
+/// Which optional parts a block has (network specification 4.1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum BlockKind {
+    /// Layer scale, no query and key norms.
+    Encoder,
+    /// Layer scale, query and key norms.
+    Aa,
+    /// Neither.
+    Decoder,
+}
+
+/// A head's decoder as a trunk; its MLPs are four times as wide as the tokens.
+fn decoder_trunk(dim: u32, depth: u32, heads: u32, eps: f64) -> Trunk {
+    Trunk { dim, depth, heads, registers: 0, mlp_ratio: 4, eps }
+}

@@ -1,0 +1,245 @@
+//! [`Plan`]: every size of a run, known before the first frame.
+//!
+//! | area | lives | holds |
+//! |---|---|---|
+//! | pairs | from the aggregator to the end | the frame and global features that heads read |
+//! | motion | motion passes to the end | raw motion maps |
+//! | work | one stage | working memory of the stage in progress |
+//!
+//! Stages never overlap in time, so `work` is as large as the largest one. The same functions that size
+//! an area also carve it.
+
+use crate::arena::carved_len;
+use crate::block::BlockShape;
+use crate::causal;
+use crate::gaussians;
+use crate::heads;
+use crate::model::{DenseHead, Model};
+use sf_formats::config::{ModelConfig, Order};
+use sf_formats::{Error, Result};
+use sf_ops::attention::FrameMask;
+use std::fmt;
+
+/// Most frames of a clip.
+pub const MAX_FRAMES: usize = 4096;
+/// Most tokens of a clip.
+pub const MAX_TOKENS: usize = 1 << 22;
+/// Most pixels of a clip.
+pub const MAX_PIXELS: usize = 1 << 30;
+/// Memory a session may take unless the caller says otherwise.
+pub const DEFAULT_MAX_BYTES: u64 = 8 << 30;
+
+/// What a session is made for: frames of one size, multiples of the patch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClipShape {
+    /// Frames of the clip.
+    pub frames: usize,
+    /// Pixels.
+    pub height: usize,
+    /// Pixels.
+    pub width: usize,
+}
+
+/// Token counts of a clip.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Dims {
+    pub(crate) frames: usize,
+    pub(crate) height: usize,
+    pub(crate) width: usize,
+    /// Patch grid.
+    pub(crate) rows: usize,
+    pub(crate) cols: usize,
+    pub(crate) patches: usize,
+    /// Encoder tokens per frame: class, registers, patches.
+    pub(crate) encoder_tokens: usize,
+    /// Aggregator tokens per frame: registers, patches.
+    pub(crate) tokens: usize,
+}
+
+impl Dims {
+    pub(crate) fn pixels(&self) -> usize {
+        self.height * self.width
+    }
+
+    /// Every token sees its own frame.
+    pub(crate) fn frame_mask(&self, tokens: usize) -> FrameMask {
+        FrameMask { frames: self.frames, tokens, lo: 0, hi: 0 }
+    }
+
+    /// Every token sees every frame.
+    pub(crate) fn global_mask(&self) -> FrameMask {
+        let reach = self.frames as i32 - 1;
+        FrameMask { frames: self.frames, tokens: self.tokens, lo: -reach, hi: reach }
+    }
+}
+
+/// Sizes of a run and the memory it takes; printable.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    pub(crate) dims: Dims,
+    /// Aggregator pairs whose features are kept, ascending.
+    pub(crate) pairs: Vec<usize>,
+    /// Values of all kept pairs, of the raw motion maps, of the working memory.
+    pub(crate) areas: [usize; 3],
+    stages: Vec<(&'static str, usize)>,
+    output_values: usize,
+    threads: usize,
+}
+
+impl Plan {
+    /// Sizes of `shape` for a model; `Input` when the shape does not fit the network, `Resource` when
+    /// it is over `max_bytes` or over a cap.
+    pub fn new(model: &Model, shape: ClipShape, threads: usize, max_bytes: u64) -> Result<Plan> {
+        let config = model.config();
+        let dims = dims(config, shape)?;
+        let w = model.weights();
+        let n = dims.frames;
+
+        let mut pairs: Vec<usize> = vec![config.aa.depth as usize / 2 - 1];
+        for head in [Some(&w.depth), w.conf.as_ref(), w.gs.as_ref()].into_iter().flatten() {
+            if let DenseHead::Dpt(dpt) = head {
+                pairs.extend(dpt.taps);
+            }
+        }
+        pairs.sort_unstable();
+        pairs.dedup();
+
+        let dim = config.aa.dim as usize;
+        let mut stages = vec![("encoder + aggregator", carved_len(trunk_lens(model, &dims, threads)))];
+        stages.push(("camera", heads::camera::scratch_len(&w.camera, &dims, threads)));
+        let raw = dims.pixels() * gaussians::CHANNELS;
+        let dense = [("depth", Some(&w.depth), 0), ("conf", w.conf.as_ref(), 0), ("gaussians", w.gs.as_ref(), raw)];
+        for (name, head, raw) in dense {
+            if let Some(head) = head {
+                stages.push((name, carved_len([raw, heads::scratch_len(head, &dims, dims.tokens, threads)])));
+            }
+        }
+        let mut motion = 0;
+        if config.has_motion() && n > 1 {
+            stages.push(("motion", causal::scratch_len(model, &dims, threads)));
+            motion = causal::raw_values(config, &dims);
+        }
+        let work = stages.iter().map(|s| s.1).max().unwrap_or(0);
+        let areas = [pairs.len() * n * dims.tokens * 2 * dim, motion, work];
+        let plan = Plan {
+            dims,
+            pairs,
+            areas,
+            stages,
+            output_values: n * dims.pixels() * crate::output::VALUES_PER_PIXEL,
+            threads,
+        };
+        let need = plan.arena_bytes() + plan.output_bytes();
+        if need > max_bytes {
+            return Err(Error::resource(
+                "plan",
+                format!(
+                    "{n} frames of {}x{} need {} MiB, the budget is {} MiB: use fewer or smaller frames, or run \
+                     the clip in windows",
+                    dims.width,
+                    dims.height,
+                    need >> 20,
+                    max_bytes >> 20
+                ),
+            ));
+        }
+        Ok(plan)
+    }
+
+    /// The clip it is made for.
+    pub fn shape(&self) -> ClipShape {
+        ClipShape { frames: self.dims.frames, height: self.dims.height, width: self.dims.width }
+    }
+
+    /// Bytes of the arena.
+    pub fn arena_bytes(&self) -> u64 {
+        4 * carved_len(self.areas) as u64
+    }
+
+    /// Bytes of the results a session holds.
+    pub fn output_bytes(&self) -> u64 {
+        4 * self.output_values as u64
+    }
+}
+
+impl fmt::Display for Plan {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let d = &self.dims;
+        let mib = |values: usize| values as f64 * 4.0 / f64::from(1 << 20);
+        writeln!(f, "clip        {} frames of {}x{}, {} threads", d.frames, d.width, d.height, self.threads)?;
+        writeln!(
+            f,
+            "tokens      {} per frame ({}x{} patches), {} in all",
+            d.tokens,
+            d.cols,
+            d.rows,
+            d.frames * d.tokens
+        )?;
+        writeln!(f, "arena       {:9.2} MiB", self.arena_bytes() as f64 / f64::from(1 << 20))?;
+        writeln!(f, "  pairs     {:9.2} MiB (kept: {:?})", mib(self.areas[0]), self.pairs)?;
+        writeln!(f, "  motion    {:9.2} MiB", mib(self.areas[1]))?;
+        writeln!(f, "  work      {:9.2} MiB, the largest of", mib(self.areas[2]))?;
+        for (name, values) in &self.stages {
+            writeln!(f, "    {:9.2} MiB {name}", mib(*values))?;
+        }
+        write!(f, "results     {:9.2} MiB", mib(self.output_values))
+    }
+}
+
+/// Checks a clip shape against the network and the caps; after this no size overflows 64 bits.
+pub(crate) fn dims(config: &ModelConfig, shape: ClipShape) -> Result<Dims> {
+    let ClipShape { frames, height, width } = shape;
+    let patch = config.patch as usize;
+    if frames == 0 {
+        return Err(Error::usage("a clip needs at least one frame"));
+    }
+    if height == 0 || width == 0 || height % patch != 0 || width % patch != 0 {
+        return Err(Error::input(
+            "clip",
+            format!("network size {width}x{height} must be a multiple of {patch} both ways: resize the frames"),
+        ));
+    }
+    let over = |what: &str, have: usize, limit: usize| {
+        Err(Error::resource(
+            "plan",
+            format!("{have} {what} in the clip, at most {limit}: use fewer or smaller frames, or windows of the clip"),
+        ))
+    };
+    if frames > MAX_FRAMES {
+        return over("frames", frames, MAX_FRAMES);
+    }
+    let pixels = height.checked_mul(width).and_then(|p| p.checked_mul(frames)).unwrap_or(usize::MAX);
+    if pixels > MAX_PIXELS {
+        return over("pixels", pixels, MAX_PIXELS);
+    }
+    let (rows, cols) = (height / patch, width / patch);
+    let patches = rows * cols;
+    let tokens = patches + config.aa.registers as usize;
+    let encoder_tokens = 1 + config.encoder.registers as usize + patches;
+    let all = frames * tokens.max(encoder_tokens);
+    if all > MAX_TOKENS {
+        return over("tokens", all, MAX_TOKENS);
+    }
+    Ok(Dims { frames, height, width, rows, cols, patches, encoder_tokens, tokens })
+}
+
+/// Encoder tokens, aggregator tokens, block scratch (also the patch embedding's image and scratch).
+pub(crate) fn trunk_lens(model: &Model, dims: &Dims, threads: usize) -> [usize; 3] {
+    let (w, dim) = (model.weights(), model.config().aa.dim as usize);
+    let block = |block, mask: FrameMask| BlockShape::of(block, threads).scratch_len(&mask);
+    let scratch = block(&w.encoder[0], dims.frame_mask(dims.encoder_tokens))
+        .max(block(&w.aa[0], dims.frame_mask(dims.tokens)))
+        .max(block(&w.aa[0], dims.global_mask()))
+        .max(carved_len(patch_lens(model.config(), dims)));
+    [dims.frames * dims.encoder_tokens * dim, dims.frames * dims.tokens * dim, scratch]
+}
+
+/// Normalised image, its patch features.
+pub(crate) fn patch_lens(config: &ModelConfig, dims: &Dims) -> [usize; 2] {
+    [dims.pixels() * 3, dims.patches * config.encoder.dim as usize]
+}
+
+/// Whether aggregator layer `i` attends over all frames.
+pub(crate) fn is_global(config: &ModelConfig, i: usize) -> bool {
+    (i % 2 == 1) == (config.aa_order == Order::FrameFirst)
+}

@@ -1,0 +1,133 @@
+//! What watches a run: stage taps, the cancel flag, the deadline, the guard against broken numbers, and
+//! the stage clock.
+
+use sf_formats::{Error, Result};
+use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// One intermediate result handed to a tap.
+#[derive(Debug)]
+pub struct Tap<'a> {
+    /// Stage name: `patches`, `encoder`, `aa.{i}`, `causal.fwd.{i}`, `gs.raw`, ...
+    pub name: &'a str,
+    /// Frame it belongs to; `None` for results of the whole clip.
+    pub frame: Option<usize>,
+    /// Row-major shape of `data`, without the frame axis where `frame` is given.
+    pub shape: &'a [usize],
+    /// The values.
+    pub data: &'a [f32],
+}
+
+/// A function that sees every stage.
+pub type TapFn<'a> = &'a mut dyn FnMut(&Tap);
+
+/// Stages of the clock, in the order of execution.
+pub(crate) const STAGES: [&str; 9] =
+    ["preprocess", "encoder", "aa.frame", "aa.global", "camera", "depth", "conf", "gaussians", "motion"];
+
+/// Watches one run.
+pub(crate) struct Probe<'a, 't> {
+    taps: Option<TapFn<'t>>,
+    cancel: &'a AtomicBool,
+    deadline: Option<Instant>,
+    clock: Instant,
+    /// Time spent per stage of [`STAGES`].
+    times: &'a mut [Duration; STAGES.len()],
+}
+
+impl<'a, 't> Probe<'a, 't> {
+    /// Starts the clock.
+    pub(crate) fn new(
+        taps: Option<TapFn<'t>>,
+        cancel: &'a AtomicBool,
+        deadline: Option<Instant>,
+        times: &'a mut [Duration; STAGES.len()],
+    ) -> Probe<'a, 't> {
+        *times = Default::default();
+        Probe { taps, cancel, deadline, clock: Instant::now(), times }
+    }
+
+    /// Whether anybody looks: stages that need extra work to show themselves ask first.
+    pub(crate) fn tapped(&self) -> bool {
+        self.taps.is_some()
+    }
+
+    /// Shows a result.
+    pub(crate) fn emit(&mut self, name: fmt::Arguments, frame: Option<usize>, shape: &[usize], data: &[f32]) {
+        if let Some(tap) = &mut self.taps {
+            assert_eq!(shape.iter().product::<usize>(), data.len(), "shape of stage {name}");
+            tap(&Tap { name: &name.to_string(), frame, shape, data });
+        }
+    }
+
+    /// Between layers: stops when cancelled or late, and when `data` holds a NaN or an infinity.
+    pub(crate) fn guard(&self, stage: fmt::Arguments, data: &[f32]) -> Result<()> {
+        if self.cancel.load(Ordering::Relaxed) {
+            return Err(Error::Deadline(format!("cancelled after {stage}")));
+        }
+        if let Some(deadline) = self.deadline
+            && Instant::now() > deadline
+        {
+            return Err(Error::Deadline(format!("deadline passed after {stage}")));
+        }
+        if !all_finite(data) {
+            let bad = data.iter().filter(|v| !v.is_finite()).count();
+            return Err(Error::integrity(
+                format!("stage {stage}"),
+                format!("{bad} of {} values are not finite: the weights are broken or do not fit f32", data.len()),
+            ));
+        }
+        Ok(())
+    }
+
+    /// Books the time since the last call on a stage of [`STAGES`].
+    pub(crate) fn lap(&mut self, stage: &str) {
+        let now = Instant::now();
+        let slot = STAGES.iter().position(|s| *s == stage).expect("a stage of the list");
+        self.times[slot] += now - self.clock;
+        self.clock = now;
+    }
+}
+
+/// Whether no value is NaN or infinite: the exponent bits are never all ones.
+pub(crate) fn all_finite(data: &[f32]) -> bool {
+    const EXPONENT: u32 = 0x7f80_0000;
+    // Whole chunks without an exit keep the loop vectorised.
+    data.chunks(4096)
+        .all(|chunk| chunk.iter().fold(0, |bad, v| bad | u32::from(v.to_bits() & EXPONENT == EXPONENT)) == 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_nan_and_infinity_are_refused() {
+        let mut data = vec![f32::MAX; 10_000];
+        data[3] = f32::MIN_POSITIVE / 4.0;
+        assert!(all_finite(&data));
+        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            for at in [0, 4095, 4096, 9999] {
+                let mut data = data.clone();
+                data[at] = bad;
+                assert!(!all_finite(&data));
+            }
+        }
+    }
+
+    #[test]
+    fn cancelled_and_late_runs_stop() {
+        let (cancel, mut times) = (AtomicBool::new(false), Default::default());
+        let probe = Probe::new(None, &cancel, None, &mut times);
+        probe.guard(format_args!("aa.1"), &[1.0]).unwrap();
+        let e = probe.guard(format_args!("aa.1"), &[f32::NAN, 0.0]).unwrap_err();
+        assert_eq!(e.status() as i32, 9);
+        assert!(e.to_string().contains("aa.1: 1 of 2"), "{e}");
+        cancel.store(true, Ordering::Relaxed);
+        assert_eq!(probe.guard(format_args!("aa.1"), &[]).unwrap_err().status() as i32, 8);
+        cancel.store(false, Ordering::Relaxed);
+        let late = Probe::new(None, &cancel, Some(Instant::now() - Duration::from_secs(1)), &mut times);
+        assert_eq!(late.guard(format_args!("aa.1"), &[]).unwrap_err().status() as i32, 8);
+    }
+}
