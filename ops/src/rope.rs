@@ -20,7 +20,7 @@ pub enum AngleRound {
     #[default]
     None,
     /// Rounded to bfloat16, as the released half-precision pipelines do (up to 0.058 rad at position 44);
-    /// the sines and cosines are rounded to bfloat16 too.
+    /// sines and cosines of the rounded angles stay f32.
     Bf16,
 }
 
@@ -56,9 +56,8 @@ impl RopeTable {
                         AngleRound::None => trig::sin_cos(angle),
                         AngleRound::Bf16 => trig::sin_cos(f64::from(bf16(angle as f32))),
                     };
-                    let (s, c) = (s as f32, c as f32);
-                    cos.push(if round == AngleRound::Bf16 { bf16(c) } else { c });
-                    sin.push(if round == AngleRound::Bf16 { bf16(s) } else { s });
+                    cos.push(c as f32);
+                    sin.push(s as f32);
                 }
             }
         }
