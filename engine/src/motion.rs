@@ -105,7 +105,7 @@ impl Map {
         }
     }
 
-    fn to_world(&self, v: [f32; 3], factor: f32) -> [f32; 3] {
+    fn world_velocity(&self, v: [f32; 3], factor: f32) -> [f32; 3] {
         let v = v.map(|x| x * factor);
         match &self.rotation {
             Some(r) => std::array::from_fn(|i| r[i][0] * v[0] + r[i][1] * v[1] + r[i][2] * v[2]),
@@ -116,7 +116,7 @@ impl Map {
     /// v+ and v- of one pixel, world axes, scene units per second.
     fn pixel(&self, raw: &Raw, u: usize) -> ([f32; 3], [f32; 3]) {
         let (f, b) = raw.velocities(u);
-        let (f, b) = (self.to_world(f, self.factor.0), self.to_world(b, self.factor.1));
+        let (f, b) = (self.world_velocity(f, self.factor.0), self.world_velocity(b, self.factor.1));
         match self.seen {
             (false, false) => ([0.0; 3], [0.0; 3]),
             (false, true) if self.mirror => (b.map(|x| -x), b),
