@@ -1,1 +1,47 @@
-//! To be written.
+//! Seeded procedural street clips with exact ground truth: colour, z-depth, object numbers, world velocity,
+//! camera poses and intrinsics.
+//!
+//! | file | what |
+//! |---|---|
+//! | `street.rs` | [`Street`], [`Options`], [`Style`], [`Split`]: a seed becomes a clip |
+//! | `scene.rs`, `frontage.rs`, `traffic.rs` | [`SceneSpec`]: the plan, what stands, what moves |
+//! | `clip.rs`, `stream.rs` | a clip as a folder; many clips as one binary stream |
+//! | `camera_motion.rs`, `motion.rs` | how the camera car and everything else moves, with exact derivatives |
+//! | `ground.rs`, `buildings.rs`, `vegetation.rs`, `furniture.rs`, `vehicles.rs`, `people.rs`, `sky.rs` | what a street is made of |
+//! | `body.rs`, `shape.rs`, `material.rs`, `texture.rs`, `light.rs`, `shadow.rs` | parts, primitives, surfaces |
+//! | `raycast.rs` | from a scene to pixels |
+//! | `math.rs` | functions and random numbers with the same bits on every CPU |
+//!
+//! Everything is a function of the seed and the options alone: no platform mathematics, no clocks, and
+//! threads only split whole frames and clips.
+#![deny(unsafe_code)]
+
+mod body;
+mod buildings;
+mod camera_motion;
+mod clip;
+mod frontage;
+mod furniture;
+mod ground;
+mod light;
+mod material;
+mod math;
+mod motion;
+mod people;
+mod raycast;
+mod scene;
+mod shadow;
+mod shape;
+mod sky;
+mod stream;
+mod street;
+mod texture;
+mod traffic;
+mod vegetation;
+mod vehicles;
+
+pub use clip::write_clip;
+pub use raycast::{FAR, ID_GROUND, ID_SKY};
+pub use scene::SceneSpec;
+pub use stream::{HEADER, MAGIC, stream};
+pub use street::{DYNAMIC, Frame, Options, Split, Street, Style};
