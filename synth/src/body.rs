@@ -2,7 +2,7 @@
 
 use crate::material::Skin;
 use crate::math::sin_cos;
-use crate::motion::{Axis, Motion, Path, Speed, Turn, follow};
+use crate::motion::{Motion, Path, Speed, Turn, follow};
 use crate::shape::Shape;
 use glam::{DMat3, DVec3};
 
@@ -143,7 +143,7 @@ impl Body {
                 let chassis = follow(path, speed, time, 0.0);
                 let (s, v) = speed.at(time);
                 out.push(chassis);
-                let spin = Turn { axis: Axis::Y, angle: s / radius, rate: v / radius };
+                let spin = Turn { angle: s / radius, rate: v / radius };
                 out.extend(axles.iter().map(|&a| chassis.joint(a, spin)));
                 if let Some(gait) = rider {
                     pedal(&chassis, gait, s, v, out);
@@ -169,7 +169,7 @@ impl Body {
 /// swings a hanging limb forward.
 fn swing(phase: (f64, f64), shift: f64, offset: f64, amplitude: f64) -> Turn {
     let (sin, cos) = sin_cos(phase.0 + shift);
-    Turn { axis: Axis::Y, angle: offset + amplitude * sin, rate: amplitude * cos * phase.1 }
+    Turn { angle: offset + amplitude * sin, rate: amplitude * cos * phase.1 }
 }
 
 /// Limbs of somebody walking: thighs in opposition, knees bent in the forward swing, arms against legs,
@@ -208,7 +208,7 @@ fn pedal(bike: &Motion, g: &Gait, s: f64, v: f64, out: &mut Vec<Motion>) {
     let turn = std::f64::consts::TAU / g.stride;
     let phase = (g.phase + s * turn, v * turn);
     let h = g.height;
-    let lean = |angle: f64| Turn { axis: Axis::Y, angle, rate: 0.0 };
+    let lean = |angle: f64| Turn { angle, rate: 0.0 };
     let trunk = bike.joint(DVec3::new(-0.22, 0.0, 0.53 * h), lean(0.45));
     out.push(trunk);
     out.push(trunk.joint(DVec3::new(0.01 * h, 0.0, 0.40 * h), lean(-0.35)));

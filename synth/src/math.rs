@@ -63,7 +63,7 @@ pub(crate) fn fract(x: f32) -> f32 {
     x - floor(x)
 }
 
-/// e^x for x <= 0, relative error < 1e-5; 0 below -80.
+/// e^x for x <= 0, relative error < 3e-5; 0 below -80.
 #[inline]
 pub(crate) fn exp_neg(x: f32) -> f32 {
     if x < -80.0 {
@@ -239,7 +239,7 @@ mod tests {
             assert!((s - x.sin()).abs() < 2e-14 && (c - x.cos()).abs() < 2e-14, "{x}");
             let e = exp_neg(-(x.abs() as f32));
             let want = (-x.abs()).exp();
-            assert!((f64::from(e) - want).abs() <= 1e-5 * want + 1e-34, "exp({x}) {e} {want}");
+            assert!((f64::from(e) - want).abs() <= 3e-5 * want + 1e-34, "exp({x}) {e} {want}");
             let (ys, xs) = ((x * 3.1).sin() as f32, (x * 1.7).cos() as f32);
             assert!((atan2(ys, xs) - ys.atan2(xs)).abs() < 5e-6, "{ys} {xs}");
             assert_eq!(floor(x as f32), (x as f32).floor());

@@ -4,7 +4,7 @@
 //! [`Motion`] maps part coordinates to the street: X = R x + t, and its velocity field is
 //! v(X) = v + w x (X - t).
 
-use crate::math::{rot_x, rot_y, rot_z, sin_cos};
+use crate::math::{rot_y, rot_z, sin_cos};
 use glam::{DMat3, DVec2, DVec3};
 
 /// Pose of a rigid part at one time, and how it moves.
@@ -20,22 +20,10 @@ pub(crate) struct Motion {
     pub(crate) w: DVec3,
 }
 
-/// Which of its own axes a joint turns about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Axis {
-    /// Roll of a vehicle, sideways swing of a limb.
-    X,
-    /// Wheel spin, forward swing of a limb.
-    Y,
-    /// Heading.
-    Z,
-}
-
-/// Angle of a joint and its rate.
+/// Angle of a joint about its sideways axis (y) and its rate: wheels spin and limbs swing about it. A
+/// positive angle rolls a wheel forward and swings a hanging limb backward.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Turn {
-    /// Axis in the parent's frame.
-    pub(crate) axis: Axis,
     /// Radians.
     pub(crate) angle: f64,
     /// Radians per second: the exact derivative of `angle`.
@@ -51,12 +39,12 @@ impl Motion {
     /// A child hinged at `offset` (in this part's coordinates).
     pub(crate) fn joint(&self, offset: DVec3, turn: Turn) -> Motion {
         let arm = self.r * offset;
-        let (local, axis) = match turn.axis {
-            Axis::X => (rot_x(turn.angle), self.r.x_axis),
-            Axis::Y => (rot_y(turn.angle), self.r.y_axis),
-            Axis::Z => (rot_z(turn.angle), self.r.z_axis),
-        };
-        Motion { r: self.r * local, t: self.t + arm, v: self.v + self.w.cross(arm), w: self.w + axis * turn.rate }
+        Motion {
+            r: self.r * rot_y(turn.angle),
+            t: self.t + arm,
+            v: self.v + self.w.cross(arm),
+            w: self.w + self.r.y_axis * turn.rate,
+        }
     }
 
     /// The same part moved by an offset in its own coordinates that changes at `rate`.
@@ -194,9 +182,9 @@ mod tests {
             for time in [0.31, 0.9, 1.7, 2.3] {
                 let at = |t: f64| {
                     follow(&path, &speed, t, 0.5)
-                        .joint(DVec3::new(1.2, 0.4, 0.3), Turn { axis: Axis::Y, angle: 0.7 * t, rate: 0.7 })
+                        .joint(DVec3::new(1.2, 0.4, 0.3), Turn { angle: 0.7 * t, rate: 0.7 })
                         .slide(DVec3::new(0.0, 0.2 * t, 0.1), DVec3::new(0.0, 0.2, 0.0))
-                        .joint(DVec3::new(0.0, 0.0, -0.5), Turn { axis: Axis::X, angle: t * t, rate: 2.0 * t })
+                        .joint(DVec3::new(0.0, 0.0, -0.5), Turn { angle: t * t, rate: 2.0 * t })
                 };
                 let local = DVec3::new(0.1, -0.3, 0.2);
                 let point = |t: f64| {

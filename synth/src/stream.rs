@@ -64,7 +64,9 @@ fn record(street: &Street) -> Result<Vec<u8>> {
     let pixels = u64::from(o.width) * u64::from(o.height);
     let payload = o.frames as u64 * (8 + 128 + 13 * pixels);
     if payload > MAX_RECORD {
-        return Err(Error::usage(format!("a clip of {payload} bytes is over {MAX_RECORD}: use fewer or smaller frames")));
+        return Err(Error::usage(format!(
+            "a clip of {payload} bytes is over {MAX_RECORD}: use fewer or smaller frames"
+        )));
     }
     let frames: Vec<Frame> = (0..o.frames).map(|i| street.frame(i)).collect();
     let mut out = Vec::with_capacity(HEADER + payload as usize);

@@ -32,8 +32,6 @@ pub(crate) enum Class {
 /// A vehicle without a place in the street.
 #[derive(Clone, Debug)]
 pub(crate) struct Model {
-    /// Kind.
-    pub(crate) class: Class,
     /// Metres, along x.
     pub(crate) length: f64,
     /// Metres, along y.
@@ -304,7 +302,6 @@ impl Model {
         }
         let height = if class == Class::Lorry { 3.25 } else { b.height };
         Model {
-            class,
             length: f64::from(b.length),
             width: f64::from(b.width),
             height: f64::from(height),
