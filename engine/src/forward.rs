@@ -202,6 +202,10 @@ impl Forward<'_> {
         motion.clear();
         motion.extend(views.iter().enumerate().map(|(f, v)| motion::Map::new(c, self.input.times, f, v.rotation())));
 
+        if !out.flags.no_motion {
+            out.neighbours.iter_mut().zip(&*motion).for_each(|(seen, map)| *seen = map.neighbours());
+        }
+
         let scale = c.world_scale as f32;
         out.depth.iter_mut().for_each(|z| *z *= scale);
         out.points.as_flattened_mut().iter_mut().for_each(|p| *p *= scale);

@@ -105,6 +105,11 @@ impl Map {
         }
     }
 
+    /// Whether the frame has a neighbour in the forward and in the backward direction.
+    pub(crate) fn neighbours(&self) -> (bool, bool) {
+        self.seen
+    }
+
     fn world_velocity(&self, v: [f32; 3], factor: f32) -> [f32; 3] {
         let v = v.map(|x| x * factor);
         match &self.rotation {

@@ -7,8 +7,11 @@ use sf_formats::scene::{Compose, SceneFrame, SplatSettings};
 use sf_formats::{Camera, Gaussians, Intrinsics, Pose, Scene};
 use sf_ops::activation::sigmoid;
 
-/// f32 values of an [`Output`] per pixel of the clip.
-pub(crate) const VALUES_PER_PIXEL: usize = 3 + 1 + 1 + 3 + 3 + 4 + 1 + 3 + 3 + 3 + 1;
+/// f32 values of an [`Output`] per pixel of the clip: points, depth, centre, scale, quaternion, opacity, colour,
+/// two velocities, dynamic probability; and the confidence where there is one.
+pub(crate) fn values_per_pixel(config: &ModelConfig) -> usize {
+    3 + 1 + 3 + 3 + 4 + 1 + 3 + 3 + 3 + 1 + usize::from(config.conf.exists())
+}
 
 /// What a caller should know about a result.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -52,6 +55,9 @@ pub struct Output {
     pub v_bwd: Vec<[f32; 3]>,
     /// Dynamic probability.
     pub dynamic: Vec<f32>,
+    /// Whether each frame has a neighbour to see in the forward and in the backward direction; without
+    /// one, its velocity in that direction is the other one mirrored (or the raw, untrained value).
+    pub neighbours: Vec<(bool, bool)>,
     /// What to know about this result.
     pub flags: Flags,
 }
@@ -86,6 +92,7 @@ impl Output {
             v_fwd: vectors(),
             v_bwd: vectors(),
             dynamic: vec![0.0; n],
+            neighbours: vec![(false, false); shape.frames],
             flags: Flags::default(),
         }
     }

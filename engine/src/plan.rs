@@ -126,7 +126,7 @@ impl Plan {
             pairs,
             areas,
             stages,
-            output_values: n * dims.pixels() * crate::output::VALUES_PER_PIXEL,
+            output_values: n * dims.pixels() * crate::output::values_per_pixel(config),
             threads,
         };
         let need = plan.arena_bytes() + plan.output_bytes();

@@ -5,7 +5,9 @@
 //! intrinsics fit. The resize is bit-exact with Pillow's 8-bit one.
 
 use crate::input::Input;
+use crate::output::FrameSource;
 use crate::plan::ClipShape;
+use sf_formats::clip::Clip;
 use sf_formats::config::{ModelConfig, Resample};
 use sf_formats::{Error, Intrinsics, Result};
 use sf_ops::resize::{Filter, resample_u8};
@@ -46,6 +48,8 @@ pub struct SourceFrame<'a> {
     pub height: u32,
     /// RGB bytes, `[height, width, 3]`.
     pub rgb: &'a [u8],
+    /// File name.
+    pub name: &'a str,
 }
 
 /// A clip brought to the network's size.
@@ -59,11 +63,28 @@ pub struct Prepared {
     pub times: Vec<f64>,
     /// Intrinsics at the network's size, where the clip had some.
     pub k: Option<Intrinsics>,
-    /// Size of every frame before.
-    pub source_sizes: Vec<(u32, u32)>,
+    /// Name and size of every frame before.
+    pub sources: Vec<FrameSource>,
 }
 
 impl Prepared {
+    /// A clip at `size` (width, height), or at the size of its own aspect that is a multiple of the patch,
+    /// no larger than the clip and than [`DEFAULT_PIXELS`].
+    pub fn from_clip(config: &ModelConfig, clip: &Clip, size: Option<(u32, u32)>) -> Result<Prepared> {
+        let first = clip.frames.first().ok_or_else(|| Error::usage("a clip needs at least one frame"))?;
+        let (w, h) = first.image.size();
+        let size = size.unwrap_or_else(|| {
+            let pixels = DEFAULT_PIXELS.min(u64::from(w) * u64::from(h));
+            fit_size(w, h, config.patch, pixels)
+        });
+        let frames: Vec<SourceFrame> = clip
+            .frames
+            .iter()
+            .map(|f| SourceFrame { width: f.image.width, height: f.image.height, rgb: &f.image.data, name: &f.name })
+            .collect();
+        prepare(config, &frames, &clip.times(), clip.intrinsics, size)
+    }
+
     /// As input of a session of the same shape.
     pub fn input(&self) -> Input<'_> {
         Input { shape: self.shape, images: &self.images, times: &self.times, k: self.k }
@@ -109,7 +130,7 @@ pub fn prepare(
         images,
         times: times.to_vec(),
         k: k.map(|k| k.resized((first.width, first.height), size)),
-        source_sizes: frames.iter().map(|f| (f.width, f.height)).collect(),
+        sources: frames.iter().map(|f| FrameSource { name: f.name.into(), size: (f.width, f.height) }).collect(),
     };
     prepared.input().check()?;
     Ok(prepared)
@@ -159,7 +180,7 @@ mod tests {
     fn frames_are_resized_with_their_intrinsics() {
         let config = ModelConfig::nano();
         let rgb = vec![90u8; 60 * 40 * 3];
-        let frame = SourceFrame { width: 60, height: 40, rgb: &rgb };
+        let frame = SourceFrame { width: 60, height: 40, rgb: &rgb, name: "a" };
         let k = Intrinsics { fx: 30.0, fy: 30.0, cx: 30.0, cy: 20.0 };
         let p = prepare(&config, &[frame, frame], &[0.0, 0.1], Some(k), (42, 28)).unwrap();
         assert_eq!(p.images, vec![90u8; 2 * 42 * 28 * 3]);
@@ -170,7 +191,7 @@ mod tests {
         assert_eq!(bad(&[frame], (41, 28)), 3);
         assert_eq!(bad(&[SourceFrame { width: 61, ..frame }], (42, 28)), 3);
         let strip = vec![0u8; 100 * 3];
-        assert_eq!(bad(&[SourceFrame { width: 100, height: 1, rgb: &strip }], (42, 28)), 3);
+        assert_eq!(bad(&[SourceFrame { width: 100, height: 1, rgb: &strip, name: "b" }], (42, 28)), 3);
         assert_eq!(bad(&[frame; 5000], (42, 28)), 5);
     }
 

@@ -128,6 +128,13 @@ impl Session {
     pub fn run_watched(&mut self, input: &Input, deadline: Option<Instant>, taps: Option<TapFn>) -> Result<&Output> {
         if input.shape != self.plan.shape() {
             let (have, want) = (input.shape, self.plan.shape());
+            if have.frames > want.frames {
+                let why = format!(
+                    "{} frames, the session is planned for {}: run windows of the clip",
+                    have.frames, want.frames
+                );
+                return Err(Error::resource("clip", why));
+            }
             return Err(Error::input("clip", format!("{have:?} in a session made for {want:?}")));
         }
         input.check()?;
