@@ -1,0 +1,180 @@
+//! Clips and weights at the edge of what the engine accepts: cases I14 to I17 and S15 of the list of bad
+//! inputs, known intrinsics, cancellation, and steady-state memory.
+
+use sf_formats::blob::Dtype;
+use sf_formats::config::{Extrapolate, Head, ModelConfig};
+use sf_formats::{Intrinsics, Status};
+use sf_tests::tiny::{Frames, model, session, stages, tensors, tiny};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+use streetforward::{ClipShape, Input, Options, Session};
+
+#[test]
+fn i14_one_frame_stands_still() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 1), Dtype::F32);
+    let clip = Frames::new(1, 28, 42, 1);
+    let mut session = session(&model, clip.shape);
+    let out = session.run(&clip.input()).unwrap();
+    assert!(out.flags.no_motion);
+    assert!(out.v_fwd.iter().chain(&out.v_bwd).flatten().chain(&out.dynamic).all(|&v| v == 0.0));
+    assert!(out.mean.iter().flatten().chain(&out.depth).all(|v| v.is_finite()));
+    assert!(out.depth.iter().all(|&z| z > 0.0));
+    let scene = out.to_scene(&config, &[]);
+    assert_eq!(scene.at(3.0, &scene.compose).unwrap().len(), 28 * 42);
+}
+
+#[test]
+fn i15_ends_without_a_neighbour_mirror_and_are_flagged() {
+    // A strict mask: the last frame's forward rows and the first frame's backward rows have no key at all.
+    let config = ModelConfig { mask_self: false, ..tiny() };
+    let model = model(&config, &tensors(&config, 2), Dtype::F32);
+    let clip = Frames::new(3, 28, 42, 2);
+    let all = stages(&model, &clip.input());
+    assert!(all.values().flatten().all(|v| v.is_finite()));
+    let mut session = session(&model, clip.shape);
+    let out = session.run(&clip.input()).unwrap();
+    assert_eq!(out.neighbours, [(true, false), (true, true), (false, true)]);
+    let px = 28 * 42;
+    for i in (0..px).chain(2 * px..3 * px) {
+        assert_eq!(out.v_fwd[i], out.v_bwd[i].map(|v| -v), "pixel {i}");
+    }
+    assert!((px..2 * px).any(|i| out.v_fwd[i] != out.v_bwd[i].map(|v| -v)));
+
+    let direct = ModelConfig { render_extrapolate: Extrapolate::Direct, ..config.clone() };
+    let model = sf_tests::tiny::model(&direct, &tensors(&direct, 2), Dtype::F32);
+    let mut session = sf_tests::tiny::session(&model, clip.shape);
+    let out = session.run(&clip.input()).unwrap();
+    assert!((0..px).any(|i| out.v_fwd[i] != out.v_bwd[i].map(|v| -v)));
+}
+
+#[test]
+fn i16_more_than_the_budget_is_refused_with_numbers() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 3), Dtype::F32);
+    let refuse = |shape: ClipShape, max_bytes: u64| {
+        let options = Options { threads: 1, max_bytes, ..Options::default() };
+        Session::new(Arc::clone(&model), shape, options).err().expect("refused")
+    };
+    let e = refuse(ClipShape { frames: 1000, height: 280, width: 518 }, 8 << 30);
+    assert_eq!(e.status(), Status::Resource);
+    assert!(e.to_string().contains("8192 MiB") && e.to_string().contains("windows"), "{e}");
+    for (frames, height, width) in [(5000, 14, 14), (4096, 14 * 1000, 14 * 1000), (1, 14 << 40, 14 << 40)] {
+        assert_eq!(refuse(ClipShape { frames, height, width }, u64::MAX).status(), Status::Resource);
+    }
+    assert_eq!(refuse(ClipShape { frames: 0, height: 14, width: 14 }, 8 << 30).status(), Status::Usage);
+    assert_eq!(refuse(ClipShape { frames: 1, height: 15, width: 14 }, 8 << 30).status(), Status::Input);
+
+    // The plan's number is the budget that just suffices.
+    let shape = ClipShape { frames: 2, height: 28, width: 42 };
+    let plan = session(&model, shape).plan().clone();
+    let need = plan.arena_bytes() + plan.output_bytes();
+    let options = Options { threads: 2, max_bytes: need, ..Options::default() };
+    let mut session = Session::new(Arc::clone(&model), shape, options).unwrap();
+    let options = Options { max_bytes: need - 1, ..options };
+    assert_eq!(Session::new(Arc::clone(&model), shape, options).err().unwrap().status(), Status::Resource);
+    assert!(plan.to_string().contains("2 frames of 42x28"), "{plan}");
+
+    // More frames than the session is planned for.
+    let long = Frames::new(3, 28, 42, 3);
+    assert_eq!(session.run(&long.input()).unwrap_err().status(), Status::Resource);
+    let other = Frames::new(2, 42, 28, 3);
+    assert_eq!(session.run(&other.input()).unwrap_err().status(), Status::Input);
+}
+
+#[test]
+fn i17_flat_repeated_and_noisy_frames_stay_finite() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 4), Dtype::F32);
+    let mut clip = Frames::new(3, 28, 42, 4);
+    let first = clip.frame_mut(0).to_vec();
+    let mut noise = sf_tests::tiny::Noise::new(9);
+    let mut run = |fill: &mut dyn FnMut(usize) -> u8| {
+        clip.images.iter_mut().enumerate().for_each(|(i, v)| *v = fill(i));
+        let mut session = session(&model, clip.shape);
+        let out = session.run(&clip.input()).unwrap();
+        out.to_scene(&config, &[]).len()
+    };
+    for pixels in [
+        run(&mut |i| first[i % first.len()]),
+        run(&mut |_| 0),
+        run(&mut |_| 255),
+        run(&mut |_| (128.0 + 127.0 * noise.draw()) as u8),
+    ] {
+        assert_eq!(pixels, 3 * 28 * 42);
+    }
+}
+
+#[test]
+fn s15_broken_numbers_stop_with_the_stage_that_made_them() {
+    let config = tiny();
+    for (name, stage) in [
+        ("encoder.blocks.1.mlp.fc2.bias", "encoder.1"),
+        ("decoder.2.attn.proj.bias", "aa.2"),
+        ("camera_head.fc_t.bias", "camera"),
+        ("point_head.proj.bias", "depth"),
+        ("gs_head.scratch.output_conv2.2.bias", "gs"),
+        ("causal.1.mlp.fc2.bias", "causal.fwd.1"),
+        ("motion_head.scratch.output_conv2.2.bias", "motion.fwd"),
+    ] {
+        let mut weights = tensors(&config, 5);
+        // Finite in the file; overflows as soon as anything is added or multiplied twice.
+        weights.get_mut(name).unwrap().iter_mut().for_each(|v| *v = f32::MAX);
+        let last = name.rsplit_once(".bias").unwrap().0;
+        weights.get_mut(&format!("{last}.weight")).unwrap().iter_mut().for_each(|v| *v = 1e38);
+        let model = model(&config, &weights, Dtype::F32);
+        let clip = Frames::new(2, 28, 42, 5);
+        let mut session = session(&model, clip.shape);
+        let e = session.run(&clip.input()).unwrap_err();
+        assert_eq!(e.status(), Status::Integrity, "{name}: {e}");
+        assert!(e.to_string().starts_with(&format!("stage {stage}")), "{name}: {e}");
+    }
+}
+
+#[test]
+fn known_intrinsics_override_the_fit() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 6), Dtype::F32);
+    let clip = Frames::new(2, 28, 42, 6);
+    let k = Intrinsics { fx: 33.0, fy: 34.0, cx: 20.0, cy: 15.0 };
+    let mut session = session(&model, clip.shape);
+    let fitted = session.run(&clip.input()).unwrap().clone();
+    let out = session.run(&Input { k: Some(k), ..clip.input() }).unwrap();
+    assert_eq!(out.k, [k, k]);
+    assert!(!out.flags.intrinsics_assumed);
+    assert_eq!(out.depth, fitted.depth);
+    assert_ne!(out.mean, fitted.mean);
+}
+
+#[test]
+fn a_network_without_gaussian_and_motion_heads_gives_a_static_scene() {
+    let config =
+        ModelConfig { gs: Head::none(), motion: Head::none(), causal_depth: 0, causal_heads: 0, time_dim: 0, ..tiny() };
+    let model = model(&config, &tensors(&config, 7), Dtype::F32);
+    let clip = Frames::new(2, 28, 42, 7);
+    let mut session = session(&model, clip.shape);
+    let out = session.run(&clip.input()).unwrap();
+    assert!(out.flags.no_motion && out.dynamic.iter().all(|&p| p == 0.0));
+    let scene = out.to_scene(&config, &[]);
+    assert!(scene.gaussians.opacity.iter().all(|&o| o == 0.0 || (o - 0.880_797).abs() < 1e-6));
+    assert_eq!(scene.gaussians.colour[5][1], f32::from(clip.images[16]) / 255.0);
+}
+
+#[test]
+fn a_session_repeats_itself_and_survives_cancellation() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 8), Dtype::F32);
+    let (clip, other) = (Frames::new(2, 28, 42, 8), Frames::new(2, 28, 42, 9));
+    let mut session = session(&model, clip.shape);
+    let first = session.run(&clip.input()).unwrap().clone();
+    let flag = session.cancel_flag();
+    flag.store(true, Ordering::Relaxed);
+    assert_eq!(session.run(&clip.input()).unwrap_err().status(), Status::Deadline);
+    flag.store(false, Ordering::Relaxed);
+    let past = Some(Instant::now());
+    assert_eq!(session.run_watched(&clip.input(), past, None).unwrap_err().status(), Status::Deadline);
+    assert_ne!(*session.run(&other.input()).unwrap(), first);
+    assert_eq!(*session.run(&clip.input()).unwrap(), first);
+    assert!(session.stage_times().map(|s| s.time).sum::<std::time::Duration>().as_nanos() > 0);
+}
