@@ -13,6 +13,7 @@
 //! | `activation.rs` `elementwise.rs` | exp, sigmoid, erf, gelu; sums, pixel shuffle |
 //! | `resize.rs` | bilinear maps, Pillow's 8-bit resize, position tables |
 //! | `trig.rs` | f64 sin, cos, exp, ln for tables |
+//! | `peak.rs` | the arithmetic peak of one core, for `doctor` and `bench` |
 //! | `reference.rs` | the definition of every op in plain loops |
 //!
 //! Activations are f32, row-major, channels last. Shape mistakes are programmer errors and panic with the
@@ -28,6 +29,7 @@ pub mod gemm;
 pub mod layernorm;
 pub mod mat;
 pub mod par;
+pub mod peak;
 pub mod reference;
 pub mod resize;
 pub mod rope;

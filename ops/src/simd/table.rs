@@ -11,6 +11,7 @@ use crate::cpu::{Features, Kernels};
 use crate::gemm::pack::RowPack;
 use crate::gemm::tile::Finish;
 use crate::layernorm::NormRow;
+use crate::peak::Width;
 use crate::resize::BilinearRow;
 use crate::rope::RopeRow;
 
@@ -37,6 +38,8 @@ pub struct VectorKernels {
     pub(crate) pack: unsafe fn(RowPack),
     /// `resize::bilinear_row`.
     pub(crate) bilinear: unsafe fn(BilinearRow),
+    /// `peak::peak_body`.
+    pub(crate) peak: unsafe fn(Width, f32) -> f32,
 }
 
 /// Every set.
@@ -45,6 +48,8 @@ pub static VECTOR: &[&VectorKernels] = &[
     &super::avx512::VECTOR,
     #[cfg(target_arch = "x86_64")]
     &super::avx2::VECTOR,
+    #[cfg(target_arch = "aarch64")]
+    &super::neon::VECTOR,
     &super::scalar::VECTOR,
 ];
 
@@ -84,6 +89,10 @@ macro_rules! vector_kernels {
             fn bilinear(row: crate::resize::BilinearRow) {
                 crate::resize::bilinear_row($token::new(), row);
             }
+            $(#[target_feature(enable = $features)])?
+            fn peak(width: crate::peak::Width, seed: f32) -> f32 {
+                crate::peak::peak_body($token::new(), width, seed)
+            }
             crate::simd::table::VectorKernels {
                 name: $name,
                 needs: $needs,
@@ -95,6 +104,7 @@ macro_rules! vector_kernels {
                 finish,
                 pack,
                 bilinear,
+                peak,
             }
         };
     };
@@ -151,5 +161,11 @@ impl Kernels {
     pub(crate) fn bilinear(&self, row: BilinearRow) {
         // SAFETY: chosen under the detected features.
         unsafe { (self.vector.bilinear)(row) }
+    }
+
+    #[inline]
+    pub(crate) fn peak(&self, width: Width, seed: f32) -> f32 {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.peak)(width, seed) }
     }
 }
