@@ -4,6 +4,8 @@
 
 use super::tile::Tile;
 use crate::cpu::{Features, Kernels};
+#[cfg(target_arch = "aarch64")]
+use crate::simd::neon;
 use crate::simd::scalar;
 #[cfg(target_arch = "x86_64")]
 use crate::simd::{avx2, avx512};
@@ -86,6 +88,26 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         run: avx2::gemm_f16,
+    },
+    #[cfg(target_arch = "aarch64")]
+    GemmKernel {
+        name: "gemm_f32_6x16_neon",
+        needs: Features::NEON,
+        weights: WeightType::F32,
+        mr: 6,
+        nr: 16,
+        rows: &[1, 2, 3, 4, 5, 6],
+        run: neon::gemm_f32,
+    },
+    #[cfg(target_arch = "aarch64")]
+    GemmKernel {
+        name: "gemm_f16_6x16_neon",
+        needs: Features::NEON,
+        weights: WeightType::F16,
+        mr: 6,
+        nr: 16,
+        rows: &[1, 2, 3, 4, 5, 6],
+        run: neon::gemm_f16,
     },
     GemmKernel {
         name: "gemm_f32_4x16_scalar",
