@@ -270,8 +270,18 @@ impl Pool {
         });
     }
 
-    /// Calls `f` with `len` values of the worker's own working memory, contents unspecified. Grows on first use,
-    /// so a second run of the same work allocates nothing.
+    /// Gives every worker at least `len` values of working memory. It is kept, so a second run of the same work
+    /// allocates nothing, whichever worker takes which task.
+    pub fn reserve_scratch(&self, len: usize) {
+        for memory in &self.scratch {
+            let mut memory = lock(memory);
+            if memory.len() < len {
+                memory.resize(len, 0.0);
+            }
+        }
+    }
+
+    /// Calls `f` with `len` values of the worker's own working memory, contents unspecified.
     pub fn with_scratch<R>(&self, worker: usize, len: usize, f: impl FnOnce(&mut [f32]) -> R) -> R {
         let mut memory = lock(&self.scratch[worker]);
         if memory.len() < len {

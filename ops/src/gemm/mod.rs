@@ -153,12 +153,14 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
     let group = panels.div_ceil(wanted).next_multiple_of(nv);
     let col_tasks = panels.div_ceil(group);
 
+    let scratch = block * (k + nv * NR);
+    ctx.pool.reserve_scratch(scratch);
     ctx.pool.run(row_tasks * col_tasks, &|task, worker| {
         let first = task / col_tasks * block;
         let rows = block.min(m - first);
         let from = task % col_tasks * group;
         let to = (from + group).min(panels);
-        ctx.pool.with_scratch(worker, block * (k + nv * NR), |memory| {
+        ctx.pool.with_scratch(worker, scratch, |memory| {
             let (packed, acc) = memory.split_at_mut(block * k);
             let mut r = 0;
             while r < rows {

@@ -5,6 +5,7 @@ mod attention;
 mod common;
 mod conv;
 mod gemm;
+mod hash;
 mod lanes;
 mod resize;
 mod rows;

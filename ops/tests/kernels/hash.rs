@@ -1,0 +1,153 @@
+//! One hash of the output bits of every op, the same on every architecture. A change here is a change of the
+//! product's numbers: it belongs in the changelog.
+
+use crate::common::{Random, everywhere};
+use sf_ops::attention::{FrameMask, attention, scratch_len};
+use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
+use sf_ops::gemm::{Act, Epilogue, Panels, gemm, pack_f16, pack_f32, panel_len};
+use sf_ops::resize::{Corners, Filter, bilinear, position_table, resample_u8};
+use sf_ops::rope::{AngleRound, QkNorm, RopeTable, qk_norm_rope};
+use sf_ops::{Ctx, Hwc, HwcMut, Mat, MatMut, elementwise, layernorm, trig};
+
+/// FNV-1a over bytes.
+struct Hash(u64);
+
+impl Hash {
+    fn bytes(&mut self, bytes: impl IntoIterator<Item = u8>) {
+        for b in bytes {
+            self.0 = (self.0 ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3);
+        }
+    }
+
+    fn values(&mut self, x: &[f32]) {
+        self.bytes(x.iter().flat_map(|v| v.to_bits().to_le_bytes()));
+    }
+}
+
+/// Every op on seeded values, sizes off the lanes.
+fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
+    let mut r = Random::new(2026);
+    let mut out = Vec::new();
+    let mut add = |name, fill: &mut dyn FnMut(&mut Hash)| {
+        let mut h = Hash(0xcbf2_9ce4_8422_2325);
+        fill(&mut h);
+        out.push((name, h.0));
+    };
+
+    let (m, n, k) = (29, 53, 300);
+    let (a, w, bias) = (r.vec(m * k), r.vec(n * k), r.vec(n));
+    let (mut full, mut half) = (vec![0.0; panel_len(n, k)], vec![0; panel_len(n, k)]);
+    pack_f32(&w, n, k, &mut full);
+    pack_f16(&w, n, k, &mut half);
+    add("gemm", &mut |h| {
+        for w in [Panels::f32(&full, n, k), Panels::f16(&half, n, k)] {
+            let mut y = vec![0.25; m * n];
+            let ep = Epilogue { bias: Some(&bias), act: Act::Gelu, gamma: Some(&bias), residual: true };
+            gemm(ctx, Mat::new(&a, m, k), w, ep, MatMut::new(&mut y, m, n));
+            h.values(&y);
+        }
+    });
+
+    let (x, g) = (r.vec(7 * 1027), r.vec(1027));
+    add("layernorm", &mut |h| {
+        let mut y = vec![0.0; x.len()];
+        layernorm::layernorm(ctx, Mat::new(&x, 7, 1027), &g, &g, 1e-6, MatMut::new(&mut y, 7, 1027));
+        h.values(&y);
+    });
+
+    let (heads, d, frames, tokens) = (3, 20, 3, 101);
+    let qkv = r.vec(frames * tokens * 3 * heads * d);
+    let positions: Vec<(u32, u32)> = (0..tokens as u32).map(|i| (i / 10, i % 10)).collect();
+    let table = RopeTable::new(&positions, d, 100.0, AngleRound::None);
+    let norm =
+        QkNorm { q_gain: &g[..d], q_offset: &g[d..2 * d], k_gain: &g[5..5 + d], k_offset: &g[9..9 + d], eps: 1e-5 };
+    let mut turned = qkv.clone();
+    add("rope", &mut |h| {
+        qk_norm_rope(ctx, MatMut::new(&mut turned, frames * tokens, 3 * heads * d), heads, Some(norm), Some(&table));
+        h.values(&turned);
+    });
+    add("attention", &mut |h| {
+        let mask = FrameMask { frames, tokens, lo: -1, hi: 0 };
+        let mut scratch = vec![0.0; scratch_len(&mask, heads, d, ctx.pool.threads())];
+        let mut y = vec![0.0; frames * tokens * heads * d];
+        let out = MatMut::new(&mut y, frames * tokens, heads * d);
+        attention(ctx, Mat::new(&turned, frames * tokens, 3 * heads * d), heads, mask, &mut scratch, out);
+        h.values(&y);
+    });
+
+    let image = r.vec(9 * 11 * 5);
+    let kernel = r.vec(19 * 45);
+    let mut panels = vec![0.0; panel_len(19, 45)];
+    pack_f32(&kernel, 19, 45, &mut panels);
+    add("conv2d", &mut |h| {
+        let conv = Conv {
+            weight: Panels::f32(&panels, 19, 45),
+            bias: Some(&bias[..19]),
+            kernel: 3,
+            stride: 2,
+            pad: 1,
+            relu_input: Act::Relu,
+            act: Act::None,
+        };
+        let mut y = vec![0.0; 5 * 6 * 19];
+        conv2d(ctx, Hwc::new(&image, 9, 11, 5), &conv, None, HwcMut::new(&mut y, 5, 6, 19));
+        h.values(&y);
+    });
+    let mut panels = vec![0.0; panel_len(28, 5)];
+    pack_f32(&kernel[..140], 28, 5, &mut panels);
+    add("conv_transpose", &mut |h| {
+        let conv = ConvTranspose { weight: Panels::f32(&panels, 28, 5), bias: Some(&bias[..7]), kernel: 2 };
+        let mut y = vec![0.0; 18 * 22 * 7];
+        conv_transpose(ctx, Hwc::new(&image, 9, 11, 5), &conv, HwcMut::new(&mut y, 18, 22, 7));
+        h.values(&y);
+    });
+    add("bilinear", &mut |h| {
+        for corners in [Corners::Aligned, Corners::Half] {
+            let mut y = vec![0.0; 20 * 13 * 5];
+            bilinear(ctx, Hwc::new(&image, 9, 11, 5), corners, HwcMut::new(&mut y, 20, 13, 5));
+            h.values(&y);
+        }
+    });
+    add("lanes", &mut |h| {
+        let ops: [fn(Ctx, &mut [f32]); 3] =
+            [elementwise::exp_in_place, elementwise::sigmoid_in_place, elementwise::gelu_in_place];
+        for op in ops {
+            let mut y: Vec<f32> = (0..4001).map(|i| (i - 2000) as f32 * 0.0123).collect();
+            op(ctx, &mut y);
+            h.values(&y);
+        }
+    });
+    add("tables", &mut |h| {
+        h.values(&position_table(&x[..49 * 3], 7, 3, (4, 9)));
+        let rgb: Vec<u8> = (0..17 * 13 * 3).map(|i| (i * 37 % 251) as u8).collect();
+        h.bytes(resample_u8(&rgb, (17, 13), Filter::Lanczos3, (8, 20)));
+        for i in 0..200 {
+            let v = f64::from(i) * 0.371 - 20.0;
+            let (s, c) = trig::sin_cos(v);
+            for y in [s, c, trig::exp(v), trig::ln(v.abs() + 0.1)] {
+                h.bytes(y.to_bits().to_le_bytes());
+            }
+        }
+    });
+    out
+}
+
+#[test]
+fn one_hash_on_every_architecture() {
+    let expected: [(&str, u64); 9] = [
+        ("gemm", 0x3b38_01f7_f874_0f00),
+        ("layernorm", 0x8906_f5da_73ab_4ea7),
+        ("rope", 0xa9fc_176d_24de_7e1c),
+        ("attention", 0x60ab_c85b_fb17_8428),
+        ("conv2d", 0x5dd3_78aa_c81e_9282),
+        ("conv_transpose", 0xe266_fa32_c915_87fd),
+        ("bilinear", 0x3aeb_e860_cceb_c040),
+        ("lanes", 0x79c0_d13b_56a9_349f),
+        ("tables", 0x8d43_277e_29b8_7224),
+    ];
+    everywhere(|ctx, name| {
+        let got = run(ctx);
+        let text: Vec<String> = got.iter().map(|(op, h)| format!("(\"{op}\", {h:#018x})")).collect();
+        assert!(got == expected, "{name} gives\n{}", text.join(",\n"));
+    });
+}
