@@ -258,7 +258,7 @@ pub fn check_times(times: &[f64]) -> Result<()> {
     }
     for (i, w) in times.windows(2).enumerate() {
         let step = w[1] - w[0];
-        if step.partial_cmp(&TIME_STEP.0) != Some(Ordering::Greater) || step >= TIME_STEP.1 {
+        if !(step > TIME_STEP.0 && step < TIME_STEP.1) {
             let why = format!(
                 "is {step} s after the frame before it; between {} and {} s are allowed",
                 TIME_STEP.0, TIME_STEP.1

@@ -109,22 +109,15 @@ pub fn decode(bytes: &[u8], at: &str, orientation: Orientation) -> Result<Decode
         let why = format!("picture of {}x{} is over the limit of 64 Mi pixels", header.width, header.height);
         return Err(Error::input(at, why));
     }
-    let mut limits = image::Limits::no_limits();
-    limits.max_alloc = Some(MAX_BYTES);
     let broken =
         |e: image::ImageError| Error::input(at, format!("cannot decode: {}", escape(e.to_string().as_bytes())));
-    match kind {
-        FileKind::Png => {
-            let d = png::PngDecoder::with_limits(Cursor::new(bytes), limits).map_err(broken)?;
-            finish(d, at, orientation)
-        }
-        _ => {
-            let mut d = jpeg::JpegDecoder::new(Cursor::new(bytes)).map_err(broken)?;
-            limits.max_alloc = None;
-            d.set_limits(limits).map_err(broken)?;
-            finish(d, at, orientation)
-        }
+    if kind == FileKind::Jpeg {
+        return finish(jpeg::JpegDecoder::new(Cursor::new(bytes)).map_err(broken)?, at, orientation);
     }
+    // Bounds what compressed profiles and texts may unpack to.
+    let mut limits = image::Limits::no_limits();
+    limits.max_alloc = Some(MAX_BYTES);
+    finish(png::PngDecoder::with_limits(Cursor::new(bytes), limits).map_err(broken)?, at, orientation)
 }
 
 /// Decodes the pixels, converts them to RGB8 and turns them upright.
