@@ -397,7 +397,7 @@ fn b15_gaps_and_hidden_bytes() {
     let f = Forge::new();
     let at = f.get_in(5, record::OFFSET);
     f.clone().set_in(5, record::OFFSET, at + 64).stamp().refused(4, "gap");
-    let padded = (0..f.rows()).find(|&i| f.get_in(i, record::LENGTH) % 64 != 0).unwrap();
+    let padded = (0..f.rows()).find(|&i| !f.get_in(i, record::LENGTH).is_multiple_of(64)).unwrap();
     let end = (f.get_in(padded, record::OFFSET) + f.get_in(padded, record::LENGTH)) as usize;
     f.clone().put(end, &[1]).stamp().refused(4, &format!("padding at byte {end} is not zero"));
     let before = f.number(header::DATA_OFFSET) - 1;
@@ -565,7 +565,7 @@ fn b30_missing_dangling_looping_forbidden() {
     symlink(path("a.sfw"), path("b.sfw")).unwrap();
     refused_file(&path("a.sfw"), 6, "symbolic links");
     let secret = saved(dir.path(), &Forge::new().0);
-    std::fs::set_permissions(&secret, std::fs::Permissions::from_mode(0)).unwrap();
+    std::fs::set_permissions(&secret, std::fs::Permissions::from_mode(0o000)).unwrap();
     // The superuser reads everything; then only the cases above say something.
     if std::fs::File::open(&secret).is_err() {
         refused_file(&secret, 6, "ermission");
