@@ -82,20 +82,23 @@ impl Seeded {
                 out.resize(n, 0.0);
                 self.fill_bias(&spec.name, out);
             }
-            Role::Table => self.random(spec, |_| 0.02, out),
+            Role::Table => self.random(spec, n, |_| 0.02, out),
             Role::Linear | Role::Conv | Role::ConvTranspose => {
                 let inputs = spec.matrix().map_or(1, |(_, k)| k);
                 let unit = 1.0 / (inputs as f64).sqrt();
-                // Values per output; transposed convolutions have no output layer to tell apart.
-                let per_output = n / spec.shape[0];
-                self.random(spec, |i| unit * self.gain(&spec.name, i / per_output), out);
+                // The first axis is the output, but in transposed convolutions, where all factors are 1.
+                self.random(spec, n / spec.shape[0], |o| unit * self.gain(&spec.name, o), out);
             }
         }
     }
 
-    fn random(&self, spec: &TensorSpec, deviation: impl Fn(usize) -> f64, out: &mut Vec<f32>) {
+    /// Random values in runs of `run` with one deviation each.
+    fn random(&self, spec: &TensorSpec, run: usize, deviation: impl Fn(usize) -> f64, out: &mut Vec<f32>) {
         let stream = Stream::new(self.seed, &spec.name);
-        out.extend((0..spec.len()).map(|i| (stream.normal(i as u64) * deviation(i)) as f32));
+        for (r, start) in (0..spec.len()).step_by(run).enumerate() {
+            let deviation = deviation(r);
+            out.extend((start..start + run).map(|i| (stream.normal(i as u64) * deviation) as f32));
+        }
     }
 
     /// Factor on the deviation of output `o` of a weight; 1 except in output layers.
