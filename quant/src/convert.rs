@@ -67,35 +67,55 @@ pub fn parse_keep(text: &str) -> Result<(String, Dtype)> {
 
 /// What a conversion would do; reads names and shapes, no values.
 pub fn plan(source: &dyn Checkpoint, options: &Options) -> Result<Report> {
-    prepare(source, options).map(|(report, _)| report)
+    prepare(source, &source.describe(), options).map(|(report, _)| report)
+}
+
+/// [`plan`] for files.
+pub fn plan_files(inputs: &[PathBuf], options: &Options) -> Result<Report> {
+    prepare(checkpoint::open(inputs)?.as_ref(), &place(inputs), options).map(|(report, _)| report)
+}
+
+/// Converts an open checkpoint to a blob.
+pub fn convert(source: &dyn Checkpoint, output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
+    convert_at(source, &source.describe(), (output, overwrite), options)
 }
 
 /// Converts files to a blob. The output must not be one of the inputs, nor a checkpoint.
 pub fn convert_files(inputs: &[PathBuf], output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
     refuse_own_input(inputs, output)?;
-    let source = checkpoint::open(inputs)?;
-    convert(source.as_ref(), output, overwrite, options)
-}
-
-/// Converts an open checkpoint to a blob.
-pub fn convert(source: &dyn Checkpoint, output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
-    let (mut report, jobs) = prepare(source, options)?;
-    // An output that cannot be written is better known before gigabytes are hashed.
-    drop(AtomicFile::create(output, overwrite)?);
-    let meta = provenance(source, options, &mut report)?;
-    let mut writer = BlobWriter::create(output, overwrite, &report.config, &meta)?;
-    stream(source, &jobs, &mut writer, &mut report)?;
-    report.blob_digest = Some(writer.finish()?);
-    Ok(report)
+    convert_at(checkpoint::open(inputs)?.as_ref(), &place(inputs), (output, overwrite), options)
 }
 
 /// Converts an open checkpoint to the bytes of a blob, for networks that fit into memory.
 pub fn convert_to_bytes(source: &dyn Checkpoint, options: &Options) -> Result<Vec<u8>> {
-    let (mut report, jobs) = prepare(source, options)?;
+    let at = source.describe();
+    let (mut report, jobs) = prepare(source, &at, options)?;
     let meta = provenance(source, options, &mut report)?;
     let mut writer = BlobWriter::in_memory(&report.config, &meta)?;
-    stream(source, &jobs, &mut writer, &mut report)?;
+    stream((source, &at), &jobs, &mut writer, &mut report)?;
     writer.finish_bytes()
+}
+
+/// `at`: what messages call the source.
+fn convert_at(
+    source: &dyn Checkpoint,
+    at: &str,
+    (output, overwrite): (&Path, Overwrite),
+    options: &Options,
+) -> Result<Report> {
+    let (mut report, jobs) = prepare(source, at, options)?;
+    // An output that cannot be written is better known before gigabytes are hashed.
+    drop(AtomicFile::create(output, overwrite)?);
+    let meta = provenance(source, options, &mut report)?;
+    let mut writer = BlobWriter::create(output, overwrite, &report.config, &meta)?;
+    stream((source, at), &jobs, &mut writer, &mut report)?;
+    report.blob_digest = Some(writer.finish()?);
+    Ok(report)
+}
+
+/// What messages call a set of files: the first.
+fn place(inputs: &[PathBuf]) -> String {
+    inputs.first().map_or_else(String::new, |p| escape_path(p))
 }
 
 /// Refuses to write over an input (by any name) or over a file that is itself a checkpoint.
@@ -134,10 +154,9 @@ struct Job {
 }
 
 /// Names, configuration, the exact set of tensors, types: everything but values.
-fn prepare(source: &dyn Checkpoint, options: &Options) -> Result<(Report, Vec<Job>)> {
-    let at = source.describe();
-    let names = resolve(source.tensors(), &at)?;
-    let (config, config_source) = configuration(source, options, &names, &at)?;
+fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Report, Vec<Job>)> {
+    let names = resolve(source.tensors(), at)?;
+    let (config, config_source) = configuration(source, options, &names, at)?;
     let specs = arch::tensors(&config);
     let (mut notes, mut ignored) = (Vec::new(), names.ignored.clone());
     let licence = options
@@ -145,7 +164,7 @@ fn prepare(source: &dyn Checkpoint, options: &Options) -> Result<(Report, Vec<Jo
         .clone()
         .or_else(|| ["licence", "license"].iter().find_map(|k| source.metadata(k)).map(str::to_string))
         .or_else(|| known_licence(&names, &specs));
-    check_image(source, &names, &config, &at)?;
+    check_image(source, &names, &config, at)?;
     let surplus = if names.vggt { surplus_pairs(&names, &config) } else { BTreeSet::new() };
     if names.vggt {
         notes.push(format!(
@@ -155,7 +174,7 @@ fn prepare(source: &dyn Checkpoint, options: &Options) -> Result<(Report, Vec<Jo
         ));
         ignored.extend(surplus.iter().cloned());
     }
-    let from = check_set(source, &names, &surplus, &specs, options, &at)?;
+    let from = check_set((source, at), (&names, &surplus), &specs, options)?;
 
     let mut used = vec![false; options.keep.len()];
     let (mut jobs, mut tensors) = (Vec::new(), Vec::new());
@@ -192,7 +211,7 @@ fn prepare(source: &dyn Checkpoint, options: &Options) -> Result<(Report, Vec<Jo
     let report = Report {
         config,
         config_source,
-        source: at,
+        source: source.describe(),
         precision: options.precision,
         tensors,
         stripped: names.stripped.into_iter().collect(),
@@ -267,12 +286,10 @@ fn surplus_pairs(names: &Names, config: &ModelConfig) -> BTreeSet<String> {
 
 /// Nothing missing, nothing unexpected, every shape equal; returns where each tensor comes from.
 fn check_set(
-    source: &dyn Checkpoint,
-    names: &Names,
-    surplus: &BTreeSet<String>,
+    (source, at): (&dyn Checkpoint, &str),
+    (names, surplus): (&Names, &BTreeSet<String>),
     specs: &[TensorSpec],
     options: &Options,
-    at: &str,
 ) -> Result<Vec<(Origin, usize)>> {
     let (mut missing, mut shapes, mut from) = (Vec::new(), Vec::new(), Vec::new());
     let mut unexpected: BTreeSet<&str> =
@@ -310,7 +327,7 @@ fn check_set(
         return Ok(from);
     }
     let hint = hint(&missing, &unexpected).map_or_else(String::new, |h| format!(" ({h})"));
-    Err(Error::model(escape(at.as_bytes()), format!("tensors do not fit{hint}: {}", faults.join("; "))))
+    Err(Error::model(at, format!("tensors do not fit{hint}: {}", faults.join("; "))))
 }
 
 /// What may have gone wrong with the names.
@@ -363,7 +380,12 @@ fn provenance(source: &dyn Checkpoint, options: &Options, report: &mut Report) -
 }
 
 /// Reads on one thread, packs and writes on the other; at most two tensors are in memory.
-fn stream(source: &dyn Checkpoint, jobs: &[Job], writer: &mut BlobWriter, report: &mut Report) -> Result<()> {
+fn stream(
+    (source, at): (&dyn Checkpoint, &str),
+    jobs: &[Job],
+    writer: &mut BlobWriter,
+    report: &mut Report,
+) -> Result<()> {
     let neutral = Seeded::new(&report.config, 0, Outputs::Neutral)?;
     let neutral = &neutral;
     std::thread::scope(|scope| {
@@ -371,7 +393,7 @@ fn stream(source: &dyn Checkpoint, jobs: &[Job], writer: &mut BlobWriter, report
         let (send, receive) = sync_channel::<Result<Vec<f32>>>(0);
         scope.spawn(move || {
             for job in jobs {
-                let values = load(source, neutral, job);
+                let values = load((source, at), neutral, job);
                 let failed = values.is_err();
                 if send.send(values).is_err() || failed {
                     return;
@@ -390,7 +412,7 @@ fn stream(source: &dyn Checkpoint, jobs: &[Job], writer: &mut BlobWriter, report
 }
 
 /// The values of one tensor, all finite.
-fn load(source: &dyn Checkpoint, neutral: &Seeded, job: &Job) -> Result<Vec<f32>> {
+fn load((source, at): (&dyn Checkpoint, &str), neutral: &Seeded, job: &Job) -> Result<Vec<f32>> {
     let mut values = Vec::new();
     match job.from {
         (Origin::Checkpoint, index) => source.read_f32(index, &mut values)?,
@@ -402,7 +424,7 @@ fn load(source: &dyn Checkpoint, neutral: &Seeded, job: &Job) -> Result<Vec<f32>
     if let Some(first) = values.iter().position(|v| !v.is_finite()) {
         let count = values.iter().filter(|v| !v.is_finite()).count();
         return Err(Error::model(
-            &job.spec.name,
+            format!("{at}: {}", job.spec.name),
             format!("value {first} is {}; {count} of {} are not finite", values[first], values.len()),
         ));
     }

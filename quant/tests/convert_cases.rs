@@ -9,7 +9,7 @@ use sf_formats::{Blob, Dtype, LoadMode, Result, Verify};
 use sf_quant::report::Origin;
 use sf_quant::seeded::CONFIG_KEY;
 use sf_quant::{
-    Options, Outputs, Seeded, convert, convert_files, convert_to_bytes, parse_keep, plan, write_safetensors,
+    Options, Outputs, Seeded, convert, convert_files, convert_to_bytes, parse_keep, plan, plan_files, write_safetensors,
 };
 use std::path::{Path, PathBuf};
 
@@ -206,6 +206,15 @@ fn c01_missing_extra_and_renamed() {
 }
 
 #[test]
+fn c01_names_the_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("part.safetensors");
+    write_safetensors(&Mock::of(&small()).without("encoder.norm"), &path, Overwrite::No).unwrap();
+    let e = plan_files(&[path], &f32s()).unwrap_err();
+    assert!(e.to_string().contains("part.safetensors: tensors do not fit: 2 missing: encoder.norm.weight"), "{e}");
+}
+
+#[test]
 fn c02_wrong_shapes() {
     let mut source = Mock::of(&small());
     let i = source.at("encoder.blocks.0.mlp.fc1.weight");
@@ -269,6 +278,8 @@ fn c03_other_element_types() {
     let (path, values) = with_dtype(dir.path(), "F16", |v| if v < 0.0 { vec![0, 0xbc] } else { vec![0, 0x3c] });
     assert_eq!(converted(path), values.iter().map(|&v| if v < 0.0 { -1.0 } else { 1.0 }).collect::<Vec<f32>>());
     let (path, _) = with_dtype(dir.path(), "I8", |v| vec![v as i8 as u8]);
+    let wrong = plan_files(std::slice::from_ref(&path), &Options { config: Some(ModelConfig::nano()), ..f32s() });
+    assert_eq!(wrong.unwrap_err().status() as i32, 2);
     let e = convert_files(&[path], &out, Overwrite::Yes, &f32s()).unwrap_err();
     assert!(e.status() as i32 == 7 && e.to_string().contains("encoder.blocks.0.attn.qkv.weight"), "{e}");
 }
