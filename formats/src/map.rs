@@ -10,7 +10,8 @@ use std::fs::{File, OpenOptions};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
-/// What tells whether an open file is still the one that was checked.
+/// What tells whether an open file is still the one that was checked. The time of the last status change
+/// is left out: it moves when another file is renamed over this one, which is harmless.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Identity {
     device: u64,
