@@ -392,20 +392,13 @@ fn verify_tensor(bytes: &[u8], t: &TensorRecord, at: &str) -> Result<()> {
             ),
         ));
     }
-    // Exponent bits all set: NaN or infinite. Folded without a branch, so it runs at memory speed.
-    let finite = match t.dtype {
-        Dtype::F32 => bytes
-            .chunks_exact(4)
-            .all_folded(|v| u32::from_le_bytes([v[0], v[1], v[2], v[3]]) & 0x7f80_0000 != 0x7f80_0000),
-        Dtype::F16 => bytes.chunks_exact(2).all_folded(|v| u16::from_le_bytes([v[0], v[1]]) & 0x7c00 != 0x7c00),
+    // Exponent bits all set: NaN or infinite.
+    let bad = match t.dtype {
+        Dtype::F32 => first(bytes, |v| u32::from_le_bytes(v) & 0x7f80_0000 == 0x7f80_0000),
+        Dtype::F16 => first(bytes, |v| u16::from_le_bytes(v) & 0x7c00 == 0x7c00),
     };
-    if !finite {
-        let size = t.dtype.size();
-        let first = bytes.chunks_exact(size).position(|v| match t.dtype {
-            Dtype::F32 => u32::from_le_bytes([v[0], v[1], v[2], v[3]]) & 0x7f80_0000 == 0x7f80_0000,
-            Dtype::F16 => u16::from_le_bytes([v[0], v[1]]) & 0x7c00 == 0x7c00,
-        });
-        return Err(Error::model(shown(), format!("value {} is NaN or infinite", first.unwrap_or(0))));
+    if let Some(i) = bad {
+        return Err(Error::model(shown(), format!("value {i} is NaN or infinite")));
     }
     if let Some((n, k)) = t.spec.matrix().filter(|(n, _)| n % LANES != 0) {
         let line = LANES * t.dtype.size();
@@ -420,14 +413,13 @@ fn verify_tensor(bytes: &[u8], t: &TensorRecord, at: &str) -> Result<()> {
     Ok(())
 }
 
-/// `all` without early exit, in a form the compiler turns into vector code.
-trait AllFolded: Iterator + Sized {
-    fn all_folded(self, test: impl Fn(Self::Item) -> bool) -> bool {
-        self.fold(true, |ok, v| ok & test(v))
-    }
+/// Index of the first value with a property. The common answer, none, is found without a branch per
+/// value, at memory speed.
+fn first<const N: usize>(bytes: &[u8], test: impl Fn([u8; N]) -> bool) -> Option<usize> {
+    let (values, _) = bytes.as_chunks::<N>();
+    let any = values.iter().fold(false, |any, &v| any | test(v));
+    if any { values.iter().position(|&v| test(v)) } else { None }
 }
-
-impl<I: Iterator> AllFolded for I {}
 
 /// What a file without our magic is, and what to do with it.
 fn not_a_blob(head: &[u8]) -> String {
