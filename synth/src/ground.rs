@@ -241,7 +241,7 @@ impl Ground {
         let root = 1.0 - k * q;
         let n = q / (1.0 + if root > 0.0 { root.sqrt() } else { 0.0 });
         let s = if k.abs() < 1e-6 { p.x } else { atan2(cx, cy) / k };
-        let foot = |axis: Vec2| 0.8 * (fx.dot(axis).abs() + fy.dot(axis).abs());
+        let foot = |axis: Vec2| fx.dot(axis).abs() + fy.dot(axis).abs();
         let main = Place { s, n, fs: foot(along), fn_: foot(across) };
         let d = self.kerb_distance(Vec4::splat(p.x), Vec4::splat(p.y)).x;
         let crossing = self.cross.as_ref().map(|c| {
@@ -276,7 +276,7 @@ impl Ground {
     fn asphalt(&self, p: Vec2, at: &Place) -> Vec3 {
         let l = &self.look;
         let f = at.fs.max(at.fn_);
-        let mut tone = 1.0 + 0.22 * fbm2(p.x, p.y, octaves(2.6, 4, l.seed), f);
+        let mut tone = 1.0 + 0.30 * fbm2(p.x, p.y, octaves(2.6, 4, l.seed), f);
         tone += 0.30 * fbm2(at.s * 0.12, at.n, octaves(1.7, 2, l.seed ^ 0x71), at.fn_);
         // Wheel tracks polish two strips in each lane.
         let track = fract(at.n / self.road.lane);

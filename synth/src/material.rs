@@ -219,8 +219,8 @@ fn wheel(at: &Spot, radius: f32, rim: Vec3) -> Look {
 fn leaves(at: &Spot, rgb: Vec3, size: f32) -> Look {
     let w = at.width();
     let clump = fbm3(at.p, octaves(size * 2.4, 2, at.seed), w);
-    let fine = fbm3(at.p, octaves(size * 0.55, 2, at.seed ^ 7), w);
-    let tone = clamp01(0.62 + 0.75 * clump + 0.75 * fine + 0.22 * at.n.z);
+    let fine = fbm3(at.p, octaves(size * 0.5, 3, at.seed ^ 7), w);
+    let tone = clamp01(0.58 + 0.45 * clump + 1.05 * fine + 0.22 * at.n.z);
     Look::matt(rgb * (0.28 + 1.05 * tone) * mix(Vec3::new(0.75, 0.9, 1.1), Vec3::new(1.25, 1.06, 0.7), tone))
 }
 

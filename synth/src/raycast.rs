@@ -5,8 +5,10 @@
 //! 2. Inside its rectangle its four rays a pixel (the centre and three around it) are tested at once;
 //!    a pixel already covered nearer than the part's box is skipped.
 //! 3. The ground is tested analytically below the horizon.
-//! 4. The nearest surface of each ray is shaded. Colour is the mean of the four rays in linear light;
-//!    depth, object and velocity come from the centre ray alone, so they never mix two surfaces.
+//! 4. Colour is the mean of the four rays in linear light. Rays of a pixel that meet the same face are shaded
+//!    once, over the whole pixel's footprint (textures filter themselves); rays that meet different
+//!    surfaces are shaded each on its own. Depth, object and velocity come from the centre ray alone,
+//!    so they never mix two surfaces.
 
 use crate::body::{Body, Part};
 use crate::ground::Ground;
@@ -88,6 +90,13 @@ struct Placed<'a> {
     motion: Motion,
     near: f32,
     rect: Rect,
+}
+
+impl Placed<'_> {
+    /// Outward normal where a ray hits.
+    fn normal(&self, (u, v, t): (f32, f32, f32)) -> Vec3 {
+        self.part.shape.normal(self.o + (self.c[0] * u + self.c[1] * v + self.c[2]) * t)
+    }
 }
 
 /// Pixel rectangle, end exclusive.
@@ -325,16 +334,7 @@ fn shade(s: &Shading, target: &Target) -> Raster {
     for y in 0..s.view.height {
         for x in 0..s.view.width {
             let i = y * s.view.width + x;
-            let mut sum = Vec3::ZERO;
-            for k in 0..4 {
-                let (u, v, t) = (s.grid.x[x][k], s.grid.y[y][k], target.depth[i][k]);
-                sum += match target.part[i][k] {
-                    SKY => s.sky(u, v),
-                    GROUND => s.ground(u, v, t, s.dark[i][k]),
-                    KERB_FACE => s.kerb(t),
-                    part => s.surface(&s.placed[part as usize], u, v, t),
-                };
-            }
+            let sum = s.pixel(x, y, &target.depth[i], &target.part[i], s.dark[i]);
             out.rgb[3 * i..3 * i + 3].copy_from_slice(&s.scene.light.develop(sum * 0.25));
             let (part, depth) = (target.part[i][0], target.depth[i][0]);
             match part {
@@ -343,7 +343,7 @@ fn shade(s: &Shading, target: &Target) -> Raster {
                     out.depth[i] = depth;
                     out.id[i] = ID_GROUND;
                 }
-                part => {
+                part if depth <= FAR => {
                     let p = &s.placed[part as usize];
                     out.depth[i] = depth;
                     out.id[i] = ID_FIRST + p.body as u16;
@@ -353,6 +353,7 @@ fn shade(s: &Shading, target: &Target) -> Raster {
                         out.velocity[i] = p.motion.velocity_at(at).as_vec3().to_array();
                     }
                 }
+                _ => {}
             }
         }
     }
@@ -360,13 +361,55 @@ fn shade(s: &Shading, target: &Target) -> Raster {
 }
 
 impl Shading<'_> {
+    /// Sum of the light of a pixel's four rays.
+    fn pixel(&self, x: usize, y: usize, depth: &Vec4, parts: &[u16; 4], dark: Vec4) -> Vec3 {
+        let (us, vs) = (self.grid.x[x], self.grid.y[y]);
+        let (mut sum, mut done) = (Vec3::ZERO, 0u32);
+        for k in 0..4 {
+            if done >> k & 1 == 1 {
+                continue;
+            }
+            let mut group: u32 = (k..4).filter(|&j| done >> j & 1 == 0 && parts[j] == parts[k]).fold(0, |m, j| m | 1 << j);
+            let ray = (us[k], vs[k], depth[k]);
+            let light = match parts[k] {
+                SKY => self.sky(ray.0, ray.1),
+                GROUND => {
+                    let (mut open, mut sun) = (0.0, 0.0);
+                    for j in (0..4).filter(|j| group >> j & 1 == 1) {
+                        let (o, s) = shadow::unpack(dark[j]);
+                        (open, sun) = (open + o, sun + s);
+                    }
+                    let share = 1.0 / group.count_ones() as f32;
+                    self.ground(ray, open * share, sun * share)
+                }
+                KERB_FACE => self.kerb(ray.2),
+                part => {
+                    let p = &self.placed[usize::from(part)];
+                    let n = p.normal(ray);
+                    if p.part.shape.has_edges() {
+                        for j in k + 1..4 {
+                            // Another face of the same part: cos of about 25 degrees.
+                            if group >> j & 1 == 1 && p.normal((us[j], vs[j], depth[j])).dot(n) < 0.9 {
+                                group &= !(1 << j);
+                            }
+                        }
+                    }
+                    self.surface(p, n, ray)
+                }
+            };
+            sum += light * group.count_ones() as f32;
+            done |= group;
+        }
+        sum
+    }
+
     fn sky(&self, u: f32, v: f32) -> Vec3 {
         let d = self.ground.c[0] * u + self.ground.c[1] * v + self.ground.c[2];
         let d = d / d.dot(d).sqrt();
         sky(&self.scene.light, d, 1.0 / self.view.focal[0])
     }
 
-    fn ground(&self, u: f32, v: f32, t: f32, dark: f32) -> Vec3 {
+    fn ground(&self, (u, v, t): (f32, f32, f32), open: f32, sun: f32) -> Vec3 {
         let c = &self.ground.c;
         let d = c[0] * u + c[1] * v + c[2];
         let p = self.ground.o + d * t;
@@ -376,8 +419,6 @@ impl Shading<'_> {
         let fy = (c[1] - d * (c[1].z * slope)) * (t / self.view.focal[1]);
         let albedo = self.scene.ground.albedo(p.truncate(), fx.truncate(), fy.truncate());
         let light = &self.scene.light;
-        // `dark` holds contact shadow in its whole part and direct sun in its fraction: see shadow.rs.
-        let (open, sun) = shadow::unpack(dark);
         let mut rgb = albedo * (light.sky_rgb * open + light.sun_rgb * (light.sun.z * sun));
         let wet = self.scene.ground.wetness();
         if wet > 0.0 {
@@ -394,19 +435,16 @@ impl Shading<'_> {
         light.through_haze(rgb, t)
     }
 
-    fn surface(&self, p: &Placed, u: f32, v: f32, t: f32) -> Vec3 {
+    fn surface(&self, p: &Placed, n: Vec3, (u, v, t): (f32, f32, f32)) -> Vec3 {
         let d = p.c[0] * u + p.c[1] * v + p.c[2];
         let at = p.o + d * t;
-        let mut n = p.part.shape.normal(at);
         let facing = n.dot(d);
         // The far side of a shell of leaves is seen from inside.
-        if facing > 0.0 {
-            n = -n;
-        }
+        let n = if facing > 0.0 { -n } else { n };
         let slope = 1.0 / if facing.abs() > 0.08 { facing.abs() } else { 0.08 };
         let (fx, fy) = (t / self.view.focal[0], t / self.view.focal[1]);
         let step = |c: Vec3, f: f32| (c + d * (c.dot(n) * slope)) * f;
-        let fp = (step(p.c[0], fx).abs() + step(p.c[1], fy).abs()) * 0.8;
+        let fp = step(p.c[0], fx).abs() + step(p.c[1], fy).abs();
         let body = &self.scene.bodies[p.body];
         let light = &self.scene.light;
         let look: Look = p.part.skin.look(&Spot { p: at, n, fp, seed: body.seed }, light);

@@ -103,6 +103,11 @@ impl Shape {
         (-half, half)
     }
 
+    /// Whether its normal jumps anywhere.
+    pub(crate) fn has_edges(&self) -> bool {
+        matches!(self, Shape::Box { .. } | Shape::Hull { .. } | Shape::Cylinder { .. })
+    }
+
     /// Outward normal at a surface point.
     pub(crate) fn normal(&self, p: Vec3) -> Vec3 {
         match self {

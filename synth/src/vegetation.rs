@@ -35,8 +35,8 @@ impl Species {
         Species {
             leaf,
             bark: rng.pick(&[Vec3::new(0.13, 0.10, 0.08), Vec3::new(0.09, 0.07, 0.055), Vec3::new(0.32, 0.31, 0.28)]),
-            clump: rng.range32(0.28, 0.5),
-            open: rng.range32(0.3, 0.75),
+            clump: rng.range32(0.22, 0.4),
+            open: rng.range32(0.5, 0.95),
             slender: rng.range32(0.8, 1.9),
             height: rng.range32(5.0, 10.0),
             bare: rng.range32(0.28, 0.4),
@@ -64,11 +64,11 @@ pub(crate) fn tree(rng: &mut Rng, species: &Species, at: DVec3) -> Body {
     let top = stem * 0.85 + 0.5 * crown;
     blob(Vec3::new(0.8 * width, 0.8 * width, 0.5 * crown), Vec3::new(0.0, 0.0, top), 0.9, 0);
     let turn = rng.range(0.0, 1.0);
-    for k in 0..5 {
-        let (sin, cos) = crate::math::sin_cos(std::f64::consts::TAU * (turn + f64::from(k) / 5.0));
-        let r = width * rng.range32(0.42, 0.62);
-        let z = top + crown * rng.range32(-0.28, 0.20);
-        let size = width * rng.range32(0.42, 0.62);
+    for k in 0..7 {
+        let (sin, cos) = crate::math::sin_cos(std::f64::consts::TAU * (turn + f64::from(k) / 7.0));
+        let r = width * rng.range32(0.42, 0.72);
+        let z = top + crown * rng.range32(-0.3, 0.26);
+        let size = width * rng.range32(0.32, 0.58);
         let at = Vec3::new(cos as f32 * r, sin as f32 * r, z);
         blob(Vec3::new(size, size, size * rng.range32(0.75, 1.1)), at, rng.range32(0.85, 1.15), k as u32 + 1);
     }
