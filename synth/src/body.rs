@@ -156,6 +156,12 @@ impl Body {
         }
     }
 
+    /// Whether a node is a wheel. Its spin is a matter of looks: what a straight-line velocity can say about it is
+    /// where its vehicle takes it, and the rim's own speed (0 to twice the vehicle's) would tear it apart.
+    pub(crate) fn spins(&self, node: usize) -> bool {
+        matches!(&self.rig, Rig::Drive { axles, .. } if (1..=axles.len()).contains(&node))
+    }
+
     /// Whether it can have a velocity at some time.
     pub(crate) fn moves(&self) -> bool {
         match &self.rig {

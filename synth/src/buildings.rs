@@ -98,7 +98,7 @@ impl House {
             Windows::Paired,
         ]);
         let modern = matches!(windows, Windows::Ribbon | Windows::Curtain);
-        let floors = if modern { 3 + rng.below(6) } else { 1 + rng.below(5) };
+        let floors = if modern { 1 + rng.below(5) } else { 1 + rng.below(3) };
         let base = rng.pick(&[Base::Shop, Base::Shop, Base::Home, Base::Home, Base::Blank]);
         let ground = rng.range32(3.3, 4.4);
         let floor = rng.range32(2.8, 3.5);
@@ -462,7 +462,7 @@ fn edge(x: f32, lo: f32, hi: f32, width: f32, footprint: f32) -> f32 {
 
 /// A far building: one box with a faint grid.
 pub(crate) fn far_tower(rng: &mut Rng, at: DVec3, heading: f64) -> Body {
-    let half = Vec3::new(rng.range32(5.0, 14.0), rng.range32(5.0, 10.0), rng.range32(5.0, 17.0));
+    let half = Vec3::new(rng.range32(5.0, 14.0), rng.range32(5.0, 10.0), rng.range32(3.5, 11.0));
     let rgb = Vec3::from(rng.pick(&WALLS)) * rng.range32(0.6, 1.0);
     let part = Part::new(Shape::Box { half }, DVec3::new(0.0, 0.0, f64::from(half.z)), Skin::Far(rgb));
     let seed = rng.seed();

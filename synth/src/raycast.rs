@@ -73,7 +73,8 @@ pub(crate) struct Raster {
     pub(crate) rgb: Vec<u8>,
     /// z-depth of the centre ray, metres; 0 where there is no surface within [`FAR`].
     pub(crate) depth: Vec<f32>,
-    /// Velocity of the material point under the centre ray, street axes, m/s.
+    /// Velocity of the material point under the centre ray, street axes, m/s; a wheel moves like the vehicle
+    /// that carries it.
     pub(crate) velocity: Vec<[f32; 3]>,
     /// Object under the centre ray.
     pub(crate) id: Vec<u16>,
@@ -87,7 +88,8 @@ struct Placed<'a> {
     o: Vec3,
     up: Vec3,
     sun: Vec3,
-    motion: Motion,
+    /// Whose velocity field the part's pixels show.
+    carrier: Motion,
     near: f32,
     rect: Rect,
 }
@@ -220,7 +222,8 @@ fn place<'a>(scene: &'a Scene, view: &View, time: f64) -> Vec<Placed<'a>> {
             let Some((rect, near)) = view.rect_of(&corners, 0.4) else { continue };
             let c = to_f32(&(inverse * view.r));
             let (up, sun) = ((inverse * DVec3::Z).as_vec3(), (inverse * sun).as_vec3());
-            placed.push(Placed { part, body, c, o, up, sun, motion, near, rect });
+            let carrier = if b.spins(part.node) { nodes[0] } else { motion };
+            placed.push(Placed { part, body, c, o, up, sun, carrier, near, rect });
         }
     }
     placed.sort_by(|a, b| a.near.total_cmp(&b.near));
@@ -350,7 +353,7 @@ fn shade(s: &Shading, target: &Target) -> Raster {
                     if s.scene.bodies[p.body].moves() {
                         let ray = DVec3::new(f64::from(s.grid.x[x].x), f64::from(s.grid.y[y].x), 1.0);
                         let at = s.view.t + s.view.r * (ray * f64::from(depth));
-                        out.velocity[i] = p.motion.velocity_at(at).as_vec3().to_array();
+                        out.velocity[i] = p.carrier.velocity_at(at).as_vec3().to_array();
                     }
                 }
                 _ => {}
@@ -369,7 +372,8 @@ impl Shading<'_> {
             if done >> k & 1 == 1 {
                 continue;
             }
-            let mut group: u32 = (k..4).filter(|&j| done >> j & 1 == 0 && parts[j] == parts[k]).fold(0, |m, j| m | 1 << j);
+            let mut group: u32 =
+                (k..4).filter(|&j| done >> j & 1 == 0 && parts[j] == parts[k]).fold(0, |m, j| m | 1 << j);
             let ray = (us[k], vs[k], depth[k]);
             let light = match parts[k] {
                 SKY => self.sky(ray.0, ray.1),

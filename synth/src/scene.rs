@@ -172,3 +172,110 @@ impl Drive {
         (path, Speed { s0: run_up, v0: self.v0, a: self.a })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::{Body, Rig};
+    use crate::raycast::ID_FIRST;
+    use crate::street::{Options, Street};
+    use glam::DVec3;
+
+    fn spec(seed: u64) -> SceneSpec {
+        SceneSpec::from_seed(seed, &Style::default())
+    }
+
+    /// Every node of everything that moves: stored twist against the difference of its poses.
+    #[test]
+    fn velocities_are_derivatives_of_poses() {
+        let h = 1e-5;
+        let (mut checked, mut fastest) = (0, 0.0f64);
+        for seed in 0..16 {
+            for body in spec(seed).scene.bodies.iter().filter(|b| b.moves()) {
+                for time in [0.23, 1.37] {
+                    let at = |t: f64| {
+                        let mut nodes = Vec::new();
+                        body.motions(t, &mut nodes);
+                        nodes
+                    };
+                    let (before, now, after) = (at(time - h), at(time), at(time + h));
+                    for k in 0..now.len() {
+                        let local = DVec3::new(0.21, -0.13, 0.17);
+                        let point = |m: &crate::motion::Motion| m.r * local + m.t;
+                        let difference = (point(&after[k]) - point(&before[k])) / (2.0 * h);
+                        let exact = now[k].velocity_at(point(&now[k]));
+                        assert!((difference - exact).length() < 1e-5, "seed {seed} node {k}: {difference} {exact}");
+                        fastest = fastest.max(exact.length());
+                        checked += 1;
+                    }
+                }
+            }
+        }
+        assert!(checked > 1_000 && fastest > 10.0, "{checked} nodes, fastest {fastest} m/s");
+    }
+
+    /// Pixels: the velocity of a frame is the field of a node of the object it shows, in the first camera's axes.
+    #[test]
+    fn pixels_show_the_velocity_of_their_part() {
+        let options = Options { width: 126, height: 84, ..Options::default() };
+        let mut moving = 0;
+        for seed in 0..8 {
+            let street = Street::new(seed, options.clone()).unwrap();
+            let frame = street.frame(7);
+            let bodies = &street.spec().scene.bodies;
+            let (r0, t0) = street.spec().ego.pose(0.0);
+            let mut nodes = Vec::new();
+            for i in 0..frame.id.len() {
+                if frame.id[i] < ID_FIRST {
+                    continue;
+                }
+                let body = &bodies[usize::from(frame.id[i] - ID_FIRST)];
+                let (x, y) = (i % 126, i / 126);
+                let p = frame.camera.unproject(x as f64 + 0.5, y as f64 + 0.5, f64::from(frame.depth[i]));
+                body.motions(frame.time, &mut nodes);
+                let v = DVec3::from(frame.velocity[i].map(f64::from));
+                let off = |m: &crate::motion::Motion| (r0.transpose() * m.velocity_at(r0 * p + t0) - v).length();
+                let least = nodes.iter().map(off).fold(f64::INFINITY, f64::min);
+                assert!(least < 1e-4, "seed {seed} pixel {i}: off by {least} m/s");
+                moving += usize::from(v.length() > 1.0);
+            }
+        }
+        assert!(moving > 1_000, "{moving}");
+    }
+
+    /// Parked and driving vehicles come from one generator: same structure, told apart by speed alone.
+    #[test]
+    fn parked_and_moving_vehicles_look_alike() {
+        let (mut parked, mut moving) = ([0usize; 32], [0usize; 32]);
+        for seed in 0..30 {
+            for body in spec(seed).scene.bodies {
+                if let Body { rig: Rig::Drive { rider: None, .. }, .. } = body {
+                    let sort = if body.moves() { &mut moving } else { &mut parked };
+                    sort[body.parts.len()] += 1;
+                }
+            }
+        }
+        let (p, m) = (parked.iter().sum::<usize>(), moving.iter().sum::<usize>());
+        assert!(p > 200 && m > 60, "{p} parked, {m} moving");
+        // Cars (8 parts) dominate both; buses and lorries mostly drive.
+        let share = |count: &[usize; 32], n: usize| count[8] as f64 / n as f64;
+        assert!(share(&parked, p) > 0.9 && share(&moving, m) > 0.7);
+    }
+
+    #[test]
+    fn nothing_drives_through_the_camera_car() {
+        for seed in 0..40 {
+            let s = spec(seed);
+            let mut nodes = Vec::new();
+            for body in s.scene.bodies.iter().filter(|b| b.moves()) {
+                for k in 0..=20 {
+                    let t = f64::from(k) * 0.1;
+                    body.motions(t, &mut nodes);
+                    let (_, eye) = s.ego.pose(t);
+                    let gap = (nodes[0].t - eye).truncate().length();
+                    assert!(gap > 1.6, "seed {seed} at {t} s: {gap} m");
+                }
+            }
+        }
+    }
+}

@@ -79,7 +79,7 @@ impl Default for Style {
             parked: 0.6,
             people: 5.0,
             cyclists: 0.25,
-            built: 0.86,
+            built: 0.76,
             trees: 0.6,
         }
     }
@@ -207,7 +207,9 @@ pub struct Frame {
     /// z-depth of the pixel centre's ray, metres, [H, W]; 0 where there is no surface within 150 m
     /// (sky, and the last strip of ground under the horizon). Those pixels have object number 0.
     pub depth: Vec<f32>,
-    /// Velocity of the material point seen at the pixel centre, world axes (the first camera's), m/s.
+    /// Velocity of the material point seen at the pixel centre, world axes (the first camera's), m/s: the exact
+    /// time derivative of the rigid part it lies on (turning vehicles and swinging limbs included). Wheels
+    /// have the velocity of the vehicle body at that point, without their spin.
     pub velocity: Vec<[f32; 3]>,
     /// Object seen at the pixel centre: 0 sky, 1 ground, then one number per object, kept over the clip.
     pub id: Vec<u16>,

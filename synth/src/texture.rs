@@ -62,7 +62,9 @@ pub(crate) fn fbm2(x: f32, y: f32, octaves: Octaves, footprint: f32) -> f32 {
             break;
         }
         let inv = 1.0 / wavelength;
-        sum += w * amplitude * (2.0 * noise2(x * inv, y * inv, octaves.seed.wrapping_add(k.wrapping_mul(0x51ED_270B))) - 1.0);
+        sum += w
+            * amplitude
+            * (2.0 * noise2(x * inv, y * inv, octaves.seed.wrapping_add(k.wrapping_mul(0x51ED_270B))) - 1.0);
         amplitude *= 0.55;
         wavelength *= 0.47;
     }
@@ -78,7 +80,9 @@ pub(crate) fn fbm3(p: Vec3, octaves: Octaves, footprint: f32) -> f32 {
         if w <= 0.0 {
             break;
         }
-        sum += w * amplitude * (2.0 * noise3(p / wavelength, octaves.seed.wrapping_add(k.wrapping_mul(0x51ED_270B))) - 1.0);
+        sum += w
+            * amplitude
+            * (2.0 * noise3(p / wavelength, octaves.seed.wrapping_add(k.wrapping_mul(0x51ED_270B))) - 1.0);
         amplitude *= 0.55;
         wavelength *= 0.47;
     }
