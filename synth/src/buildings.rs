@@ -402,7 +402,8 @@ impl Facade {
         // Goods: blocks of colour behind the glass, fading to their mean.
         let (i, j) = (floor(u / 0.55), floor(z / 0.6));
         let h = hash2(i as i32, j as i32, seed ^ 0x60);
-        let own = Vec3::new(unit(h), unit(h.rotate_left(9)), unit(h.rotate_left(18))) * (0.3 * unit(h.rotate_left(25)));
+        let own =
+            Vec3::new(unit(h), unit(h.rotate_left(9)), unit(h.rotate_left(18))) * (0.22 * unit(h.rotate_left(25)));
         let goods = mix(Vec3::splat(0.075), own, fade(0.55, fu.max(fz)));
         let lamp = Vec3::new(1.0, 0.85, 0.6) * (0.10 + 0.75 * light.lamps);
         let inside = Look { albedo: Vec3::splat(0.03) + goods * 0.5, glow: goods * lamp * 1.2, mirror: 0.25 };

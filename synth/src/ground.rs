@@ -134,7 +134,7 @@ impl Ground {
         cross: Option<(f64, Road)>,
         crosswalks: Vec<f64>,
     ) -> Ground {
-        let grey = rng.range32(0.055, 0.13);
+        let grey = rng.range32(0.045, 0.115);
         let tint = rng.range32(-0.03, 0.05);
         let yellow = rng.chance(0.45);
         let grass = if rng.chance(0.5) { rng.range32(0.6, 1.0) } else { 0.0 };
@@ -284,11 +284,11 @@ impl Ground {
         tone += 0.07 * clamp01(1.0 - w * 7.0) * fade(self.road.lane * 0.4, at.fn_);
         let cell = [crate::math::floor(at.s / 9.0) as i32, crate::math::floor(at.n / 3.4) as i32];
         let h = hash2(cell[0], cell[1], l.seed ^ 0x9a);
-        if unit(h) < 0.16 * l.patches {
+        if unit(h) < 0.22 * l.patches {
             let (u, v) = (at.s - 9.0 * cell[0] as f32, at.n - 3.4 * cell[1] as f32);
             let (u0, v0) = (unit(h.rotate_left(7)) * 3.0, unit(h.rotate_left(13)) * 0.8);
             let (u1, v1) = (u0 + 2.0 + 4.0 * unit(h.rotate_left(19)), v0 + 1.0 + 1.4 * unit(h.rotate_left(25)));
-            tone *= 1.0 - 0.28 * band(u, u0, u1, at.fs) * band(v, v0, v1, at.fn_);
+            tone *= 1.0 - 0.36 * band(u, u0, u1, at.fs) * band(v, v0, v1, at.fn_);
         } else if unit(h) > 0.93 {
             let r = ((at.s - 9.0 * cell[0] as f32 - 4.5).powi(2) + (at.n - 3.4 * cell[1] as f32 - 1.7).powi(2)).sqrt();
             tone *= 1.0 - 0.4 * band(r, 0.24, 0.34, f) - 0.22 * band(r, -1.0, 0.24, f);

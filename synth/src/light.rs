@@ -82,9 +82,9 @@ impl Light {
                 zenith = Vec3::new(0.86, 0.92, 1.0) * grey * rng.range32(0.75, 1.0);
                 horizon = Vec3::new(0.98, 0.99, 1.0) * grey;
                 sun_rgb = Vec3::splat(rng.range32(0.0, 0.25));
-                sky_rgb = Vec3::new(0.90, 0.95, 1.0) * 1.12;
+                sky_rgb = Vec3::new(0.92, 0.96, 1.0) * 0.98;
                 cover = rng.range32(0.8, 1.0);
-                haze = rng.range32(0.001, 0.009);
+                haze = rng.range32(0.000_5, 0.006);
                 gain = rng.range32(0.9, 1.15);
             }
             Weather::Dim => {

@@ -89,6 +89,8 @@ pub(crate) enum Skin {
     Paint(Box<Paint>),
     /// Wheel: cylinder along z; radius and rim colour.
     Wheel(f32, Vec3),
+    /// Bicycle wheel: cylinder along z; radius.
+    Spokes(f32),
     /// Foliage: colour and clump size, metres.
     Leaves(Vec3, f32),
     /// Bark.
@@ -124,6 +126,13 @@ impl Skin {
             Skin::Blocks(rgb, size) => blocks(at, *rgb, *size),
             Skin::Paint(p) => p.look(at, light),
             Skin::Wheel(radius, rim) => wheel(at, *radius, *rim),
+            Skin::Spokes(radius) => {
+                // Thin tyre; spokes and the view between them as one middle grey.
+                let f = at.fp.x.max(at.fp.y);
+                let r = (at.p.x * at.p.x + at.p.y * at.p.y).sqrt();
+                let tyre = band(r, 0.90 * radius, 2.0 * radius, f).max(band(r, -1.0, 0.08 * radius, f));
+                Look::matt(Vec3::splat(0.13 - 0.11 * tyre))
+            }
             Skin::Leaves(rgb, size) => leaves(at, *rgb, *size),
             Skin::Bark(rgb) => {
                 let p = Vec3::new(at.p.x * 6.0, at.p.y * 6.0, at.p.z * 0.8);

@@ -140,7 +140,7 @@ pub(crate) fn cyclist(rng: &mut Rng, path: Path, speed: Speed) -> Body {
     for node in 1..=axles.len() {
         let wheel = Shape::Cylinder { radius: 0.34, half: 0.018 };
         let lie = rot_x(std::f64::consts::FRAC_PI_2);
-        parts.push(Part::new(wheel, DVec3::ZERO, Skin::Wheel(0.34, Vec3::splat(0.25))).turned(lie).on(node));
+        parts.push(Part::new(wheel, DVec3::ZERO, Skin::Spokes(0.34)).turned(lie).on(node));
     }
     let gait = Gait { height: h, phase: rng.range(0.0, std::f64::consts::TAU), swing: 0.4, stride: 4.6 };
     Body {

@@ -86,7 +86,7 @@ fn route(plan: &Plan, rng: &mut Rng, model: &Model, bicycle: bool) -> (Path, Spe
         Some(cross) if kind > 0.62 => return crossing(plan, rng, cross, (cruise, a)),
         _ => {}
     }
-    if kind < 0.45 {
+    if kind < 0.36 {
         let n = kerbside(road.lane_centre(rng.below(lanes) as u32, Direction::With));
         let same = (n - plan.lane).abs() < 1.0;
         let gap = 2.3 + 0.5 * model.length;
