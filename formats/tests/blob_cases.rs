@@ -562,6 +562,24 @@ fn b24_every_bit_flipped() {
     good.put(at, &[flipped]).refused(9, &format!("tensor {name}: SHA-256"));
 }
 
+/// Over 1 MiB two threads share the tensors; the fault named is still the first one.
+#[test]
+fn the_first_of_several_damaged_tensors_is_named() {
+    let trunk = Trunk { dim: 64, depth: 6, heads: 1, registers: 0, mlp_ratio: 4, eps: 1e-6 };
+    let good = Forge(build(&ModelConfig { encoder: trunk.clone(), aa: trunk, ..tiny() }));
+    assert!(good.0.len() > 1 << 20);
+    Blob::from_bytes(&good.0).unwrap();
+    for damaged in [&[0][..], &[good.rows() - 1], &[9, 10, 11], &[100, 30, 31, 99]] {
+        let mut f = good.clone();
+        for &i in damaged {
+            let at = f.get_in(i, record::OFFSET) as usize;
+            f.0[at] ^= 1;
+        }
+        let name = good.name(*damaged.iter().min().unwrap()).1;
+        f.refused(9, &format!("tensor {name}: SHA-256"));
+    }
+}
+
 #[test]
 fn b25_another_digest_expected() {
     let blob = Blob::from_bytes(&Forge::new().0).unwrap();
