@@ -391,7 +391,7 @@ fn stream(
     std::thread::scope(|scope| {
         // A rendezvous: the reader is one tensor ahead. It ends when the writer hangs up.
         let (send, receive) = sync_channel::<Result<Vec<f32>>>(0);
-        scope.spawn(move || {
+        let read = move || {
             for job in jobs {
                 let values = load((source, at), neutral, job);
                 let failed = values.is_err();
@@ -399,7 +399,10 @@ fn stream(
                     return;
                 }
             }
-        });
+        };
+        std::thread::Builder::new()
+            .spawn_scoped(scope, read)
+            .map_err(|e| Error::resource(at, format!("cannot start the reading thread: {e}")))?;
         for (job, row) in jobs.iter().zip(&mut report.tensors) {
             let values = receive.recv().map_err(|_| Error::Internal("the reading thread ended early".into()))??;
             row.promoted = job.dtype == Dtype::F16 && !fits_f16(&values);
