@@ -290,7 +290,8 @@ impl Ground {
             let (u1, v1) = (u0 + 2.0 + 4.0 * unit(h.rotate_left(19)), v0 + 1.0 + 1.4 * unit(h.rotate_left(25)));
             tone *= 1.0 - 0.36 * band(u, u0, u1, at.fs) * band(v, v0, v1, at.fn_);
         } else if unit(h) > 0.93 {
-            let r = ((at.s - 9.0 * cell[0] as f32 - 4.5).powi(2) + (at.n - 3.4 * cell[1] as f32 - 1.7).powi(2)).sqrt();
+            let (u, v) = (at.s - 9.0 * cell[0] as f32 - 4.5, at.n - 3.4 * cell[1] as f32 - 1.7);
+            let r = (u * u + v * v).sqrt();
             tone *= 1.0 - 0.4 * band(r, 0.24, 0.34, f) - 0.22 * band(r, -1.0, 0.24, f);
         }
         // A crack runs where slow noise crosses its middle.

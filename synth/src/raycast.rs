@@ -142,7 +142,7 @@ impl View {
             lo = lo.min(q);
             hi = hi.max(q);
         };
-        for (i, &p) in points.iter().enumerate() {
+        for &p in points {
             near = near.min(p.z);
             if p.z >= NEAR {
                 grow(p);
@@ -150,8 +150,6 @@ impl View {
                 for &b in points.iter().filter(|b| b.z < NEAR) {
                     grow(p + (b - p) * ((p.z - NEAR) / (p.z - b.z)));
                 }
-            } else if i == 7 && near == f32::INFINITY {
-                return None;
             }
         }
         let visible = lo.x < hi.x && hi.x > 0.0 && hi.y > 0.0;

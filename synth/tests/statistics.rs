@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use sf_formats::atomic::Overwrite;
 use sf_formats::clip::{Clip, ClipOptions, GroundTruth};
-use sf_synth::{DYNAMIC, FAR, ID_GROUND, ID_SKY, Options, Street, write_clip};
+use sf_synth::{DYNAMIC, FAR, ID_GROUND, ID_SKY, Options, Street, Style, write_clip};
 
 struct Clip50 {
     dynamic: f64,
@@ -89,6 +89,39 @@ fn a_written_clip_reads_back() {
     }
     assert!((clip.intrinsics.unwrap().fx - street.intrinsics().fx).abs() < 1e-6);
     assert!(write_clip(&street, &folder, Overwrite::No).is_err());
+}
+
+/// Corners of the option space draw without a fault.
+#[test]
+fn extreme_styles_draw() {
+    let empty =
+        Style { traffic: 0.0, vehicles: (0, 0), people: 0.0, built: 0.0, parked: 0.0, trees: 0.0, ..Style::default() };
+    let full = Style {
+        traffic: 1.0,
+        vehicles: (40, 40),
+        people: 40.0,
+        built: 1.0,
+        parked: 1.0,
+        trees: 1.0,
+        turning: 1.0,
+        hfov: (120.0, 120.0),
+        curvature: 0.05,
+        acceleration: 5.0,
+        yaw: 30.0,
+        ..Style::default()
+    };
+    for style in [empty, full] {
+        for seed in 0..4 {
+            let long =
+                Options { frames: 60, fps: 1.0, width: 48, height: 16, style: style.clone(), ..Options::default() };
+            let street = Street::new(seed, long).unwrap();
+            for i in [0, 30, 59] {
+                let frame = street.frame(i);
+                assert!(frame.depth.iter().all(|d| d.is_finite()));
+                frame.camera.check("camera").unwrap();
+            }
+        }
+    }
 }
 
 #[test]
