@@ -2,7 +2,7 @@
 
 use crate::activation::exp_lanes;
 use crate::cpu::{Ctx, Kernels};
-use crate::gemm::pack::RowPack;
+use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
 use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::mat::{Mat, MatMut};
@@ -44,8 +44,6 @@ const QUERIES: usize = 2 * NR;
 /// Keys between two rescalings, a multiple of every kernel's tile height (4, 6, 12). 96 keys x 32 queries of scores
 /// are 12 KiB, which stay in the first-level cache together with the sums.
 const KEYS: usize = 96;
-/// Tallest tile of any kernel; room for the padding of the last one.
-const MAX_MR: usize = 16;
 
 /// Scores of up to [`KEYS`] keys for 16 queries, and the running state of those queries.
 pub(crate) struct SoftmaxTile<'a> {
@@ -137,7 +135,8 @@ impl Job<'_> {
             let rows = kernel.mr.min(tokens - t);
             let x = &self.qkv.data[base + c + t * stride..];
             let width = kernel.fit(rows);
-            self.kernels.pack(RowPack { x, stride, rows, k: d, width, scale: 1.0, out: &mut k[t * d..] });
+            let from = strided(x, stride, rows);
+            self.kernels.pack(RowPack { from, k: d, width, change: Change::Keep, out: &mut k[t * d..] });
         }
         for r in (0..d).step_by(kernel.mr) {
             let rows = kernel.mr.min(d - r);
@@ -165,8 +164,10 @@ impl Job<'_> {
         let scale = 1.0 / (d as f32).sqrt();
         for p in 0..QUERIES / NR {
             let rows = NR.min(queries.saturating_sub(p * NR));
-            let x = &self.qkv.data[((frame * tokens + first + p * NR) * stride + head * d).min(self.qkv.data.len())..];
-            self.kernels.pack(RowPack { x, stride, rows, k: d, width: NR, scale, out: &mut q[p * NR * d..] });
+            let row = frame * tokens + first + p * NR;
+            let x = &self.qkv.data[(row * stride + head * d).min(self.qkv.data.len())..];
+            let (from, out) = (strided(x, stride, rows), &mut q[p * NR * d..]);
+            self.kernels.pack(RowPack { from, k: d, width: NR, change: Change::Scale(scale), out });
         }
         sums.fill(0.0);
         let mut top = [[f32::NEG_INFINITY; NR]; QUERIES / NR];

@@ -6,6 +6,7 @@
 //! outputs `[ky][kx][out]` are scattered while they are stored.
 
 use crate::cpu::{Ctx, Kernels};
+use crate::gemm::pack::{Change, MAX_MR, RowPack};
 use crate::gemm::{Act, AddTo, NR, Panels, Product, RowSink, Rows, Sink, Source, product};
 use crate::mat::{Hwc, HwcMut};
 use crate::par::SharedMut;
@@ -82,35 +83,25 @@ struct Windows<'a> {
 }
 
 impl Source for Windows<'_> {
-    fn pack(&self, _kernels: &Kernels, first: usize, rows: usize, width: usize, out: &mut [f32]) {
+    fn pack(&self, kernels: &Kernels, first: usize, rows: usize, width: usize, out: &mut [f32]) {
         let Windows { x, ow, kernel, stride, pad, relu } = *self;
-        let c = x.c;
-        out[..kernel * kernel * c * width].fill(0.0);
-        for r in 0..rows {
-            let (oy, ox) = ((first + r) / ow, (first + r) % ow);
-            for ky in 0..kernel {
-                let y = oy * stride + ky;
-                if y < pad || y - pad >= x.h {
-                    continue;
-                }
-                // Columns of the kernel inside the image: their pixels are neighbours in memory.
-                let left = ox * stride;
-                let kx0 = pad.saturating_sub(left);
-                let kx1 = kernel.min((x.w + pad).saturating_sub(left));
-                if kx0 >= kx1 {
-                    continue;
-                }
-                let run = &x.data[((y - pad) * x.w + left + kx0 - pad) * c..][..(kx1 - kx0) * c];
-                let to = &mut out[(ky * kernel + kx0) * c * width..];
-                if relu {
-                    for (v, o) in run.iter().zip(to[r..].iter_mut().step_by(width)) {
-                        *o = if *v < 0.0 { 0.0 } else { *v };
-                    }
-                } else {
-                    for (v, o) in run.iter().zip(to[r..].iter_mut().step_by(width)) {
-                        *o = *v;
+        let change = if relu { Change::Relu } else { Change::Keep };
+        // Without padding a line of the kernel is one run of neighbours in memory; with it, each pixel may be
+        // inside or outside.
+        let (steps, run) = if pad == 0 { (1, kernel * x.c) } else { (kernel, x.c) };
+        for ky in 0..kernel {
+            for kx in 0..steps {
+                let mut from: [&[f32]; MAX_MR] = [&[]; MAX_MR];
+                for (r, from) in from.iter_mut().enumerate().take(rows) {
+                    let (oy, ox) = ((first + r) / ow, (first + r) % ow);
+                    // In the padded image.
+                    let (py, px) = (oy * stride + ky, ox * stride + kx);
+                    if py >= pad && py - pad < x.h && px >= pad && px - pad < x.w {
+                        *from = &x.data[((py - pad) * x.w + px - pad) * x.c..];
                     }
                 }
+                let out = &mut out[(ky * kernel + kx) * x.c * width..];
+                kernels.pack(RowPack { from, k: run, width, change, out });
             }
         }
     }

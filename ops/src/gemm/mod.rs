@@ -7,7 +7,7 @@ pub(crate) mod tile;
 use crate::cpu::{Ctx, Kernels};
 use crate::mat::{Mat, MatMut};
 use crate::par::SharedMut;
-use pack::RowPack;
+use pack::{Change, RowPack, strided};
 use tile::{Finish, Tile};
 
 pub use pack::{NR, PanelData, Panels, pack_f16, pack_f32, panel_len, unpack};
@@ -59,7 +59,7 @@ impl Source for Rows<'_> {
     fn pack(&self, kernels: &Kernels, first: usize, rows: usize, width: usize, out: &mut [f32]) {
         let Mat { data, cols, stride, .. } = self.0;
         let x = &data[(first * stride).min(data.len())..];
-        kernels.pack(RowPack { x, stride, rows, k: cols, width, scale: 1.0, out });
+        kernels.pack(RowPack { from: strided(x, stride, rows), k: cols, width, change: Change::Keep, out });
     }
 }
 

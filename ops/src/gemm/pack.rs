@@ -4,6 +4,9 @@
 //! output: element (n, k) lies at `(n / 16 * K + k) * 16 + n % 16`. Outputs beyond n are zeros. With f32 one
 //! step of k is one cache line; with f16 (IEEE half bits, round to nearest even) half a line.
 
+use crate::activation::relu_lanes;
+use crate::simd::{LANES, Simd, Vector};
+
 /// Outputs per panel.
 pub const NR: usize = 16;
 
@@ -95,44 +98,76 @@ pub fn unpack(panels: Panels) -> Vec<f32> {
     w
 }
 
-/// Rows of activations to be packed for a tile: `out[k][r] = scale * x[r][k]`.
+/// Tallest tile of any kernel.
+pub(crate) const MAX_MR: usize = LANES;
+
+/// What happens to a value on its way into a tile.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Change {
+    Keep,
+    /// x < 0 ? 0 : x.
+    Relu,
+    Scale(f32),
+}
+
+/// Rows of activations to be packed for a tile: `out[k][r] = change(from[r][k])`.
 pub(crate) struct RowPack<'a> {
-    /// Row 0.
-    pub x: &'a [f32],
-    /// Values from one row to the next.
-    pub stride: usize,
-    /// Rows that exist.
-    pub rows: usize,
+    /// At least `k` values each; an empty row is zeros.
+    pub from: [&'a [f32]; MAX_MR],
     /// Values of each row to take.
     pub k: usize,
-    /// Rows of the tile; those beyond `rows` are zeros.
+    /// Rows of the tile.
     pub width: usize,
-    /// Factor of every value.
-    pub scale: f32,
+    /// Applied to every value.
+    pub change: Change,
     /// `[k][width]`.
     pub out: &'a mut [f32],
 }
 
-/// Steps of k taken from one row before the next: a cache line of each row stays in use.
-const STEP: usize = 16;
-
-/// Packs rows. Plain indexing: it moves each value once for every pass over the weights.
-#[inline(always)]
-pub(crate) fn pack_rows(t: RowPack) {
-    let RowPack { x, stride, rows, k, width, scale, out } = t;
-    let out = &mut out[..k * width];
-    if rows < width {
-        out.fill(0.0);
+/// `rows` rows of a matrix, the others empty.
+#[inline]
+pub(crate) fn strided(x: &[f32], stride: usize, rows: usize) -> [&[f32]; MAX_MR] {
+    let mut from: [&[f32]; MAX_MR] = [&[]; MAX_MR];
+    for (r, row) in from.iter_mut().enumerate().take(rows) {
+        *row = &x[r * stride..];
     }
-    for k0 in (0..k).step_by(STEP) {
-        let len = STEP.min(k - k0);
-        let block = &mut out[k0 * width..][..len * width];
-        for r in 0..rows {
-            let from = &x[r * stride + k0..][..len];
-            for (v, o) in from.iter().zip(block[r..].iter_mut().step_by(width)) {
-                *o = v * scale;
+    from
+}
+
+/// Packs rows in blocks of 16 x 16, transposed in registers.
+#[inline(always)]
+pub(crate) fn pack_rows<S: Simd>(s: S, t: RowPack) {
+    let RowPack { from, k, width, change, out } = t;
+    let out = &mut out[..k * width];
+    let mut k0 = 0;
+    while k0 < k {
+        let len = LANES.min(k - k0);
+        let mut block = [[0.0f32; LANES]; LANES];
+        for r in 0..width.min(MAX_MR) {
+            if from[r].is_empty() {
+                continue;
+            }
+            if let Some(row) = from[r][k0..].first_chunk::<LANES>() {
+                block[r] = *row;
+            } else {
+                block[r][..len].copy_from_slice(&from[r][k0..k0 + len]);
+            }
+            match change {
+                Change::Keep => {}
+                Change::Relu => relu_lanes(s, s.load(&block[r])).store(&mut block[r]),
+                Change::Scale(f) => (s.load(&block[r]) * s.splat(f)).store(&mut block[r]),
             }
         }
+        s.transpose(&mut block);
+        for (i, lanes) in block[..len].iter().enumerate() {
+            let at = (k0 + i) * width;
+            // Sixteen at once where there is room: what runs over is written again by the next step.
+            match out[at..].first_chunk_mut::<LANES>() {
+                Some(to) => *to = *lanes,
+                None => out[at..at + width].copy_from_slice(&lanes[..width]),
+            }
+        }
+        k0 += len;
     }
 }
 

@@ -49,6 +49,54 @@ impl Simd for Avx2 {
             V(_mm256_cvtph_ps(_mm_loadu_si128(p)), _mm256_cvtph_ps(_mm_loadu_si128(p.add(1))))
         }
     }
+
+    #[inline(always)]
+    fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
+        // SAFETY: the token proves avx2; every load and store is half a row of the array.
+        unsafe {
+            let half = |x: &[[f32; LANES]; LANES], row: usize, col: usize| {
+                let mut r = [_mm256_setzero_ps(); 8];
+                for i in 0..8 {
+                    r[i] = _mm256_loadu_ps(x[row + i].as_ptr().add(col));
+                }
+                transpose8(r)
+            };
+            let (a, b) = (half(x, 0, 0), half(x, 0, 8));
+            let (c, d) = (half(x, 8, 0), half(x, 8, 8));
+            for i in 0..8 {
+                _mm256_storeu_ps(x[i].as_mut_ptr(), a[i]);
+                _mm256_storeu_ps(x[i].as_mut_ptr().add(8), c[i]);
+                _mm256_storeu_ps(x[8 + i].as_mut_ptr(), b[i]);
+                _mm256_storeu_ps(x[8 + i].as_mut_ptr().add(8), d[i]);
+            }
+        }
+    }
+}
+
+/// Eight rows of eight, swapped.
+///
+/// # Safety
+/// The CPU has avx2.
+#[inline(always)]
+unsafe fn transpose8(r: [__m256; 8]) -> [__m256; 8] {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let mut q = [_mm256_setzero_ps(); 8];
+        for i in [0, 4] {
+            let (ab_lo, ab_hi) = (_mm256_unpacklo_ps(r[i], r[i + 1]), _mm256_unpackhi_ps(r[i], r[i + 1]));
+            let (cd_lo, cd_hi) = (_mm256_unpacklo_ps(r[i + 2], r[i + 3]), _mm256_unpackhi_ps(r[i + 2], r[i + 3]));
+            q[i] = _mm256_shuffle_ps::<0x44>(ab_lo, cd_lo);
+            q[i + 1] = _mm256_shuffle_ps::<0xee>(ab_lo, cd_lo);
+            q[i + 2] = _mm256_shuffle_ps::<0x44>(ab_hi, cd_hi);
+            q[i + 3] = _mm256_shuffle_ps::<0xee>(ab_hi, cd_hi);
+        }
+        let mut y = r;
+        for c in 0..4 {
+            y[c] = _mm256_permute2f128_ps::<0x20>(q[c], q[4 + c]);
+            y[4 + c] = _mm256_permute2f128_ps::<0x31>(q[c], q[4 + c]);
+        }
+        y
+    }
 }
 
 impl Add for V {

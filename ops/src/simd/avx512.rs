@@ -47,6 +47,39 @@ impl Simd for Avx512 {
         // SAFETY: the token proves avx512f; 16 values of 2 bytes are readable.
         unsafe { V(_mm512_cvtph_ps(_mm256_loadu_si256(x.as_ptr().cast::<__m256i>()))) }
     }
+
+    #[inline(always)]
+    fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
+        // SAFETY: the token proves avx512f; every load and store is one row of the array.
+        unsafe {
+            let mut r = [_mm512_setzero_ps(); LANES];
+            for i in 0..LANES {
+                r[i] = _mm512_loadu_ps(x[i].as_ptr());
+            }
+            // Inside the four 128-bit groups: pairs, then quads, so that q[4i + c] holds columns c, c + 4, c + 8, c + 12
+            // of rows 4i..4i + 3.
+            let mut q = [_mm512_setzero_ps(); LANES];
+            for i in (0..LANES).step_by(4) {
+                let (ab_lo, ab_hi) = (_mm512_unpacklo_ps(r[i], r[i + 1]), _mm512_unpackhi_ps(r[i], r[i + 1]));
+                let (cd_lo, cd_hi) = (_mm512_unpacklo_ps(r[i + 2], r[i + 3]), _mm512_unpackhi_ps(r[i + 2], r[i + 3]));
+                q[i] = _mm512_shuffle_ps::<0x44>(ab_lo, cd_lo);
+                q[i + 1] = _mm512_shuffle_ps::<0xee>(ab_lo, cd_lo);
+                q[i + 2] = _mm512_shuffle_ps::<0x44>(ab_hi, cd_hi);
+                q[i + 3] = _mm512_shuffle_ps::<0xee>(ab_hi, cd_hi);
+            }
+            // Across the groups.
+            for c in 0..4 {
+                let a = _mm512_shuffle_f32x4::<0x88>(q[c], q[4 + c]);
+                let b = _mm512_shuffle_f32x4::<0xdd>(q[c], q[4 + c]);
+                let d = _mm512_shuffle_f32x4::<0x88>(q[8 + c], q[12 + c]);
+                let e = _mm512_shuffle_f32x4::<0xdd>(q[8 + c], q[12 + c]);
+                _mm512_storeu_ps(x[c].as_mut_ptr(), _mm512_shuffle_f32x4::<0x88>(a, d));
+                _mm512_storeu_ps(x[4 + c].as_mut_ptr(), _mm512_shuffle_f32x4::<0x88>(b, e));
+                _mm512_storeu_ps(x[8 + c].as_mut_ptr(), _mm512_shuffle_f32x4::<0xdd>(a, d));
+                _mm512_storeu_ps(x[12 + c].as_mut_ptr(), _mm512_shuffle_f32x4::<0xdd>(b, e));
+            }
+        }
+    }
 }
 
 impl Add for V {

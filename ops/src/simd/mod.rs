@@ -33,6 +33,17 @@ pub(crate) trait Simd: Copy {
     fn load(self, x: &[f32; LANES]) -> Self::V;
     /// Lane i from the half-precision bits `x[i]`; exact.
     fn load_f16(self, x: &[u16; LANES]) -> Self::V;
+    /// Swaps rows and columns.
+    #[inline(always)]
+    fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
+        for i in 0..LANES {
+            for j in 0..i {
+                let v = x[i][j];
+                x[i][j] = x[j][i];
+                x[j][i] = v;
+            }
+        }
+    }
 }
 
 /// Sixteen f32 lanes.

@@ -83,7 +83,7 @@ macro_rules! vector_kernels {
             }
             $(#[target_feature(enable = $features)])?
             fn pack(rows: crate::gemm::pack::RowPack) {
-                crate::gemm::pack::pack_rows(rows);
+                crate::gemm::pack::pack_rows($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
             fn bilinear(row: crate::resize::BilinearRow) {
