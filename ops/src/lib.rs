@@ -2,9 +2,9 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | `mat.rs` | [`Mat`](mat::Mat), [`Hwc`](mat::Hwc): borrowed matrices and images |
+//! | `mat.rs` | [`Mat`], [`Hwc`]: borrowed matrices and images |
 //! | `par.rs` | [`Pool`](par::Pool): the threads; the only file that makes any |
-//! | `cpu.rs` | [`Features`](cpu::Features), [`Isa`](cpu::Isa), [`Kernels`](cpu::Kernels), [`Ctx`](cpu::Ctx): what this CPU can do and which rows follow |
+//! | `cpu.rs` | [`Features`](cpu::Features), [`Isa`](cpu::Isa), [`Kernels`], [`Ctx`]: what this CPU can do and which rows follow |
 //! | `simd/` | 16-lane vectors, one file per instruction set, and the table of vector kernels |
 //! | `gemm/` | matrix product with f32 or f16 weights in K1N16 panels; its table and packers |
 //! | `attention.rs` | frame-masked attention with streaming softmax |
