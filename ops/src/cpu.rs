@@ -238,63 +238,108 @@ pub struct Ctx<'a> {
     pub kernels: &'static Kernels,
 }
 
+/// The floating-point control word of this architecture.
+#[cfg(target_arch = "x86_64")]
+mod control {
+    /// Power-on value of MXCSR: every exception masked, round to nearest, subnormals kept.
+    pub(super) const DEFAULT: u64 = 0x1f80;
+    /// Rounding control, flush to zero, denormals are zero; the sticky exception flags do not matter.
+    pub(super) const MATTERS: u64 = 0xe040;
+
+    pub(super) fn get() -> u64 {
+        let mut mode: u32 = 0;
+        // SAFETY: stores MXCSR into a local; SSE is part of x86-64.
+        #[allow(unsafe_code)]
+        unsafe {
+            std::arch::asm!("stmxcsr [{}]", in(reg) &mut mode, options(nostack, preserves_flags));
+        }
+        u64::from(mode)
+    }
+
+    /// `mode` must be `DEFAULT` or come from [`get`].
+    pub(super) fn set(mode: u64) {
+        let mode = mode as u32;
+        // SAFETY: loads a value that MXCSR had or has at power-on; SSE is part of x86-64.
+        #[allow(unsafe_code)]
+        unsafe {
+            std::arch::asm!("ldmxcsr [{}]", in(reg) &mode, options(nostack, readonly, preserves_flags));
+        }
+    }
+}
+
+/// The floating-point control word of this architecture.
+#[cfg(target_arch = "aarch64")]
+mod control {
+    /// Reset value of FPCR.
+    pub(super) const DEFAULT: u64 = 0;
+    /// RMode, FZ, FZ16, DN.
+    pub(super) const MATTERS: u64 = 0x03c8_0000;
+
+    pub(super) fn get() -> u64 {
+        let mode: u64;
+        // SAFETY: reads the floating-point control register of this thread.
+        #[allow(unsafe_code)]
+        unsafe {
+            std::arch::asm!("mrs {}, fpcr", out(reg) mode, options(nomem, nostack, preserves_flags));
+        }
+        mode
+    }
+
+    /// `mode` must be `DEFAULT` or come from [`get`].
+    pub(super) fn set(mode: u64) {
+        // SAFETY: writes the floating-point control register of this thread.
+        #[allow(unsafe_code)]
+        unsafe {
+            std::arch::asm!("msr fpcr, {}", in(reg) mode, options(nomem, nostack, preserves_flags));
+        }
+    }
+}
+
+/// The control word is not known on this architecture; it is taken as default.
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+mod control {
+    pub(super) const DEFAULT: u64 = 0;
+    pub(super) const MATTERS: u64 = 0;
+
+    pub(super) fn get() -> u64 {
+        DEFAULT
+    }
+
+    pub(super) fn set(_mode: u64) {}
+}
+
 /// Puts the calling thread's floating-point unit in the default mode: round to nearest, subnormals kept.
 /// New threads inherit their creator's mode, and both settings change results.
-#[cfg(target_arch = "x86_64")]
 pub fn set_default_float_mode() {
-    let mode: u32 = 0x1f80;
-    // SAFETY: loads the power-on value into MXCSR; SSE is part of x86-64.
-    #[allow(unsafe_code)]
-    unsafe {
-        std::arch::asm!("ldmxcsr [{}]", in(reg) &mode, options(nostack, readonly, preserves_flags));
-    }
+    control::set(control::DEFAULT);
 }
 
 /// Whether the calling thread rounds to nearest and keeps subnormals.
-#[cfg(target_arch = "x86_64")]
 pub fn float_mode_is_default() -> bool {
-    let mut mode: u32 = 0;
-    // SAFETY: stores MXCSR into a local; SSE is part of x86-64.
-    #[allow(unsafe_code)]
-    unsafe {
-        std::arch::asm!("stmxcsr [{}]", in(reg) &mut mode, options(nostack, preserves_flags));
-    }
-    // Rounding control, flush to zero, denormals are zero; the sticky exception flags do not matter.
-    mode & 0xe040 == 0
+    control::get() & control::MATTERS == control::DEFAULT & control::MATTERS
 }
 
-/// Puts the calling thread's floating-point unit in the default mode: round to nearest, subnormals kept.
-/// New threads inherit their creator's mode, and both settings change results.
-#[cfg(target_arch = "aarch64")]
-pub fn set_default_float_mode() {
-    // SAFETY: writes the reset value into the floating-point control register of this thread.
-    #[allow(unsafe_code)]
-    unsafe {
-        std::arch::asm!("msr fpcr, {}", in(reg) 0u64, options(nomem, nostack, preserves_flags));
+/// The default floating-point mode on this thread while alive; the mode before comes back on drop.
+#[derive(Debug)]
+pub struct DefaultFloatMode {
+    before: u64,
+    /// A control word belongs to its thread: not `Send`.
+    thread: std::marker::PhantomData<*const ()>,
+}
+
+impl DefaultFloatMode {
+    /// Switches this thread to the default mode.
+    pub fn enter() -> DefaultFloatMode {
+        let before = control::get();
+        control::set(control::DEFAULT);
+        DefaultFloatMode { before, thread: std::marker::PhantomData }
     }
 }
 
-/// Whether the calling thread rounds to nearest and keeps subnormals.
-#[cfg(target_arch = "aarch64")]
-pub fn float_mode_is_default() -> bool {
-    let mode: u64;
-    // SAFETY: reads the floating-point control register of this thread.
-    #[allow(unsafe_code)]
-    unsafe {
-        std::arch::asm!("mrs {}, fpcr", out(reg) mode, options(nomem, nostack, preserves_flags));
+impl Drop for DefaultFloatMode {
+    fn drop(&mut self) {
+        control::set(self.before);
     }
-    // RMode, FZ, FZ16, DN.
-    mode & 0x03c8_0000 == 0
-}
-
-/// Nothing to set on this architecture.
-#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-pub fn set_default_float_mode() {}
-
-/// Not known on this architecture; taken as default.
-#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-pub fn float_mode_is_default() -> bool {
-    true
 }
 
 #[cfg(test)]
@@ -328,11 +373,12 @@ mod tests {
         assert!(float_mode_is_default());
         #[cfg(target_arch = "x86_64")]
         {
-            let flush: u32 = 0x1f80 | 0x8000;
-            // SAFETY: loads a valid MXCSR value; put back two lines on.
-            #[allow(unsafe_code)]
-            unsafe {
-                std::arch::asm!("ldmxcsr [{}]", in(reg) &flush, options(nostack, readonly, preserves_flags));
+            // Flush to zero, as a host program may have set it.
+            control::set(0x1f80 | 0x8000);
+            assert!(!float_mode_is_default());
+            {
+                let _mode = DefaultFloatMode::enter();
+                assert!(float_mode_is_default());
             }
             assert!(!float_mode_is_default());
             set_default_float_mode();
