@@ -19,11 +19,7 @@ pub(crate) struct Arena {
 impl Arena {
     /// Memory for `len` values; `Resource` when the system has none.
     pub(crate) fn new(len: usize) -> Result<Arena> {
-        let mut block = Vec::new();
-        block.try_reserve_exact(len + LINE).map_err(|_| {
-            Error::resource("arena", format!("{} bytes are not available: use fewer or smaller frames", len * 4))
-        })?;
-        block.resize(len + LINE, 0.0f32);
+        let block = filled("arena", len + LINE, 0.0f32)?;
         let address = block.as_ptr() as usize;
         let start = (address.next_multiple_of(4 * LINE) - address) / 4;
         Ok(Arena { block, start, len })
@@ -33,6 +29,17 @@ impl Arena {
     pub(crate) fn all(&mut self) -> &mut [f32] {
         &mut self.block[self.start..self.start + self.len]
     }
+}
+
+/// `len` copies of `value`; `Resource` when the system has no memory for them.
+pub(crate) fn filled<T: Clone>(what: &str, len: usize, value: T) -> Result<Vec<T>> {
+    let mut out = Vec::new();
+    out.try_reserve_exact(len).map_err(|_| {
+        let bytes = len.saturating_mul(size_of::<T>());
+        Error::resource(what, format!("{bytes} bytes are not available: use fewer or smaller frames"))
+    })?;
+    out.resize(len, value);
+    Ok(out)
 }
 
 /// Values a slice of `len` takes in the arena.

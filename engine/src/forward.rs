@@ -34,17 +34,17 @@ pub(crate) struct Memory {
 }
 
 impl Memory {
-    pub(crate) fn new(model: &Model, shape: ClipShape) -> Memory {
+    pub(crate) fn new(model: &Model, shape: ClipShape) -> Result<Memory> {
         let n = shape.frames;
-        Memory {
-            output: Output::new(shape, model.config().conf.exists()),
+        Ok(Memory {
+            output: Output::new(shape, model.config().conf.exists())?,
             cameras: vec![RawCamera::default(); n],
             raw_poses: vec![Pose::IDENTITY; n],
             fov: vec![0.0; 2 * n],
             gaussians: Vec::with_capacity(n),
             motion: Vec::with_capacity(n),
             views: Vec::with_capacity(n),
-        }
+        })
     }
 }
 

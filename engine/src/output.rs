@@ -1,10 +1,11 @@
 //! [`Output`]: what the network says about one clip; and the [`Scene`] made of it.
 
+use crate::arena::filled;
 use crate::gaussians::CONF_MIN;
 use crate::plan::ClipShape;
 use sf_formats::config::{ModelConfig, Sky};
 use sf_formats::scene::{Compose, SceneFrame, SplatSettings};
-use sf_formats::{Camera, Gaussians, Intrinsics, Pose, Scene};
+use sf_formats::{Camera, Gaussians, Intrinsics, Pose, Result, Scene};
 use sf_ops::activation::sigmoid;
 
 /// f32 values of an [`Output`] per pixel of the clip: points, depth, centre, scale, quaternion, opacity, colour,
@@ -73,28 +74,29 @@ pub struct FrameSource {
 
 impl Output {
     /// Room for the results of a clip shape.
-    pub(crate) fn new(shape: ClipShape, with_conf: bool) -> Output {
+    pub(crate) fn new(shape: ClipShape, with_conf: bool) -> Result<Output> {
         let n = shape.frames * shape.height * shape.width;
-        let vectors = || vec![[0.0; 3]; n];
-        Output {
+        let scalars = |len: usize| filled("results", len, 0.0);
+        let vectors = || filled("results", n, [0.0; 3]);
+        Ok(Output {
             shape,
             times: vec![0.0; shape.frames],
             poses: vec![Pose::IDENTITY; shape.frames],
             k: vec![Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 }; shape.frames],
-            points: vectors(),
-            depth: vec![0.0; n],
-            conf: vec![0.0; if with_conf { n } else { 0 }],
-            mean: vectors(),
-            scale: vectors(),
-            quat: vec![[1.0, 0.0, 0.0, 0.0]; n],
-            opacity: vec![0.0; n],
-            colour: vectors(),
-            v_fwd: vectors(),
-            v_bwd: vectors(),
-            dynamic: vec![0.0; n],
+            points: vectors()?,
+            depth: scalars(n)?,
+            conf: scalars(if with_conf { n } else { 0 })?,
+            mean: vectors()?,
+            scale: vectors()?,
+            quat: filled("results", n, [1.0, 0.0, 0.0, 0.0])?,
+            opacity: scalars(n)?,
+            colour: vectors()?,
+            v_fwd: vectors()?,
+            v_bwd: vectors()?,
+            dynamic: scalars(n)?,
             neighbours: vec![(false, false); shape.frames],
             flags: Flags::default(),
-        }
+        })
     }
 
     /// Camera of frame `f` at the network's size.
@@ -228,7 +230,7 @@ mod tests {
     use super::*;
 
     fn output() -> Output {
-        let mut o = Output::new(ClipShape { frames: 1, height: 1, width: 4 }, true);
+        let mut o = Output::new(ClipShape { frames: 1, height: 1, width: 4 }, true).unwrap();
         o.mean = vec![[0.1, 0.1, 1.0], [0.3, 0.3, 1.2], [0.2, 0.2, 1.1], [0.0, 1.0, 2.0]];
         o.depth = vec![1.0, 1.2, 1.1, 2.0];
         o.scale = vec![[0.1; 3], [0.3; 3], [0.1; 3], [0.1; 3]];

@@ -10,6 +10,7 @@ use crate::plan::ClipShape;
 use sf_formats::clip::Clip;
 use sf_formats::config::{ModelConfig, Resample};
 use sf_formats::{Error, Intrinsics, Result};
+use sf_ops::cpu::DefaultFloatMode;
 use sf_ops::resize::{Filter, resample_u8};
 
 /// Pixels per frame the public model was trained with at most (Pi3's loader).
@@ -101,6 +102,7 @@ pub fn prepare(
 ) -> Result<Prepared> {
     let first = frames.first().ok_or_else(|| Error::usage("a clip needs at least one frame"))?;
     let shape = ClipShape { frames: frames.len(), height: size.1 as usize, width: size.0 as usize };
+    let _mode = DefaultFloatMode::enter();
     // Caps before the allocation below.
     crate::plan::dims(config, shape)?;
     let filter = match config.image_resample {

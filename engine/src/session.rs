@@ -13,10 +13,10 @@ use crate::plan::{ClipShape, DEFAULT_MAX_BYTES, Plan};
 use crate::probe::{Probe, STAGES, TapFn};
 use crate::tables::Tables;
 use sf_formats::{Error, Result};
-use sf_ops::cpu::{self, Ctx, Isa, Kernels};
+use sf_ops::cpu::{Ctx, DefaultFloatMode, Isa, Kernels};
 use sf_ops::par::Pool;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 /// Most threads of a session.
@@ -64,6 +64,7 @@ pub struct Session {
 impl Session {
     /// Plans and allocates for one clip shape.
     pub fn new(model: Arc<Model>, shape: ClipShape, options: Options) -> Result<Session> {
+        let _mode = DefaultFloatMode::enter();
         if options.threads > MAX_THREADS {
             return Err(Error::usage(format!("{} threads: at most {MAX_THREADS}", options.threads)));
         }
@@ -79,8 +80,9 @@ impl Session {
         let plan = Plan::new(&model, shape, threads, options.max_bytes)?;
         let pool = Pool::new(threads)
             .map_err(|e| Error::resource("threads", format!("the system refused {threads} threads: {e}")))?;
+        meet(&pool);
         let arena = Arena::new(carved_len(plan.areas))?;
-        let memory = Memory::new(&model, shape);
+        let memory = Memory::new(&model, shape)?;
         let tables = Tables::new(&model, &plan.dims);
         let cancel = Arc::new(AtomicBool::new(false));
         Ok(Session { model, pool, kernels, plan, tables, arena, memory, cancel, times: Default::default() })
@@ -138,12 +140,8 @@ impl Session {
             return Err(Error::input("clip", format!("{have:?} in a session made for {want:?}")));
         }
         input.check()?;
-        if !cpu::float_mode_is_default() {
-            return Err(Error::unsupported(
-                "floating-point mode",
-                "the calling thread flushes subnormals or does not round to nearest: reset its control word",
-            ));
-        }
+        self.model.blob().unchanged()?;
+        let _mode = DefaultFloatMode::enter();
         let [pairs, motion, work] = carve(self.arena.all(), self.plan.areas);
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
@@ -156,4 +154,17 @@ impl Session {
     pub fn output(&self) -> &Output {
         &self.memory.output
     }
+}
+
+/// Returns when every thread of the pool has run: the system starts threads late on a busy machine, and a
+/// thread's start allocates, which belongs here and not into a run.
+fn meet(pool: &Pool) {
+    let here = AtomicUsize::new(0);
+    pool.run(pool.threads(), &|_, _| {
+        here.fetch_add(1, Ordering::SeqCst);
+        // Nobody takes a second task before all have one.
+        while here.load(Ordering::SeqCst) < pool.threads() {
+            std::thread::yield_now();
+        }
+    });
 }
