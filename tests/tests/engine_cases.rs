@@ -1,5 +1,5 @@
-//! Clips and weights at the edge of what the engine accepts: cases I14 to I17 and S15 of the list of bad
-//! inputs, known intrinsics, cancellation, and steady-state memory.
+//! Clips, weights and hosts at the edge of what the engine accepts: cases I14 to I17, P01, P02, P11, P16 and
+//! S15 of the list of bad inputs; known intrinsics; cancellation.
 
 use sf_formats::blob::Dtype;
 use sf_formats::config::{Extrapolate, Head, ModelConfig};
@@ -177,4 +177,56 @@ fn a_session_repeats_itself_and_survives_cancellation() {
     assert_ne!(*session.run(&other.input()).unwrap(), first);
     assert_eq!(*session.run(&clip.input()).unwrap(), first);
     assert!(session.stage_times().map(|s| s.time).sum::<std::time::Duration>().as_nanos() > 0);
+}
+
+#[test]
+fn p01_p02_thread_counts_are_bounded() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 9), Dtype::F32);
+    let shape = ClipShape { frames: 1, height: 14, width: 14 };
+    let make = |threads| Session::new(Arc::clone(&model), shape, Options { threads, ..Options::default() });
+    let all = std::thread::available_parallelism().unwrap().get().min(streetforward::MAX_THREADS);
+    assert_eq!(make(0).unwrap().threads(), all);
+    assert_eq!(make(65).err().unwrap().status(), Status::Usage);
+}
+
+#[test]
+fn p11_two_sessions_share_a_model() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 10), Dtype::F16);
+    let clip = Frames::new(2, 28, 42, 10);
+    let run = || session(&model, clip.shape).run(&clip.input()).unwrap().clone();
+    let (a, b) = std::thread::scope(|s| {
+        let other = s.spawn(run);
+        (run(), other.join().unwrap())
+    });
+    assert_eq!(a, b);
+}
+
+/// A host that flushes subnormals and rounds to zero gets the same bits, and its own mode back.
+#[test]
+#[cfg(target_arch = "x86_64")]
+fn p16_the_host_control_word_changes_nothing() {
+    let set = |mode: u32| {
+        // SAFETY: loads a valid MXCSR value (exceptions masked) on this test's own thread.
+        unsafe { std::arch::asm!("ldmxcsr [{}]", in(reg) &mode, options(nostack, readonly, preserves_flags)) }
+    };
+    let get = || {
+        let mut mode = 0u32;
+        // SAFETY: stores MXCSR into a local.
+        unsafe { std::arch::asm!("stmxcsr [{}]", in(reg) &mut mode, options(nostack, preserves_flags)) };
+        mode & 0xffc0
+    };
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 11), Dtype::F32);
+    let clip = Frames::new(2, 28, 42, 11);
+    let plain = session(&model, clip.shape).run(&clip.input()).unwrap().clone();
+    // Round to zero, flush to zero, denormals are zero.
+    let odd = 0x1f80 | 0x6000 | 0x8000 | 0x0040;
+    set(odd);
+    let other = session(&model, clip.shape).run(&clip.input()).unwrap().clone();
+    let mode = get();
+    set(0x1f80);
+    assert_eq!(mode, odd);
+    assert_eq!(plain, other);
 }

@@ -11,6 +11,8 @@ use sf_formats::ModelConfig;
 use sf_formats::blob::{Blob, Dtype};
 use sf_formats::blob_writer::{BlobWriter, fits_f16};
 use sf_formats::meta::Meta;
+use sf_ops::cpu::{Isa, Kernels};
+use sf_quant::seeded::{Outputs, Seeded};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -106,7 +108,10 @@ impl Golden {
 
 /// Every stage of a fast run, frames joined.
 fn fast(model: &Arc<Model>, input: &Input, threads: usize) -> BTreeMap<String, Stage> {
-    let options = Options { threads, ..Options::default() };
+    fast_with(model, input, Options { threads, ..Options::default() })
+}
+
+fn fast_with(model: &Arc<Model>, input: &Input, options: Options) -> BTreeMap<String, Stage> {
     let mut session = Session::new(Arc::clone(model), input.shape, options).unwrap();
     let mut stages: BTreeMap<String, Stage> = BTreeMap::new();
     let mut tap = |tap: &streetforward::Tap| {
@@ -190,13 +195,50 @@ fn thread_counts_change_no_bit() {
             let one = fast(&model, &golden.input(), 1);
             for threads in [2, 3] {
                 let more = fast(&model, &golden.input(), threads);
-                assert_eq!(one.keys().collect::<Vec<_>>(), more.keys().collect::<Vec<_>>());
-                for (name, stage) in &one {
-                    let bits = |s: &Stage| s.data.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
-                    assert!(bits(stage) == bits(&more[name]), "{} {name}: {threads} threads", golden.name);
-                }
+                same_bits(&format!("{}, {threads} threads", golden.name), &one, &more);
             }
         }
+    }
+}
+
+fn same_bits(title: &str, a: &BTreeMap<String, Stage>, b: &BTreeMap<String, Stage>) {
+    assert_eq!(a.keys().collect::<Vec<_>>(), b.keys().collect::<Vec<_>>(), "{title}");
+    for (name, stage) in a {
+        let bits = |s: &Stage| s.data.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert!(bits(stage) == bits(&b[name]), "{title}: {name}");
+    }
+}
+
+#[test]
+fn instruction_sets_change_no_bit() {
+    let isas: Vec<Isa> = Kernels::available().map(|k| k.isa).collect();
+    println!("compared: {isas:?}");
+    assert!(isas.contains(&Isa::Scalar));
+    for golden in Golden::all() {
+        let model = golden.model(Dtype::F16);
+        let run =
+            |isa| fast_with(&model, &golden.input(), Options { threads: 2, isa: Some(isa), ..Options::default() });
+        let scalar = run(Isa::Scalar);
+        for &isa in isas.iter().filter(|&&isa| isa != Isa::Scalar) {
+            same_bits(&format!("{}, {isa:?}", golden.name), &scalar, &run(isa));
+        }
+    }
+}
+
+/// The converter's own output, read back by both paths.
+#[test]
+fn a_converted_checkpoint_gives_what_the_checkpoint_says() {
+    let config = sf_tests::tiny::tiny();
+    let seeded = Seeded::new(&config, 3, Outputs::Random).unwrap();
+    let clip = sf_tests::tiny::Frames::new(3, 28, 42, 3);
+    let weights = reference::Weights::load(&seeded, &config).unwrap();
+    let reference = reference::run(&weights, &config, &clip.input()).unwrap();
+    for (dtype, limit) in [(Dtype::F32, FAST), (Dtype::F16, HALF)] {
+        let bytes = sf_quant::convert::convert_to_bytes(&seeded, &sf_quant::convert::Options::to(dtype)).unwrap();
+        let model = Arc::new(Model::from_blob(Blob::from_bytes(&bytes).unwrap()).unwrap());
+        assert_eq!(*model.config(), config);
+        let count = compare(dtype.name(), &fast(&model, &clip.input(), 2), &reference.0, limit);
+        assert!(count > 30, "{count} stages");
     }
 }
 
