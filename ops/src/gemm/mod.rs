@@ -7,7 +7,7 @@ pub(crate) mod tile;
 use crate::cpu::{Ctx, Kernels};
 use crate::mat::{Mat, MatMut};
 use crate::par::SharedMut;
-use pack::{Change, RowPack, strided};
+use pack::{Change, MAX_MR, RowPack, strided};
 use tile::{Finish, Tile};
 
 pub use pack::{NR, PanelData, Panels, pack_f16, pack_f32, panel_len, unpack};
@@ -136,6 +136,12 @@ const GROUP: usize = 4;
 /// Panels of the widest kernel.
 const MAX_NV: usize = 2;
 
+/// Most f32 values of working memory that each thread of the pool keeps after products (or convolutions) of up to
+/// `k` inputs, whatever the kernel; for memory plans.
+pub fn working_memory(k: usize) -> usize {
+    PACKED.max(MAX_MR * k) + TILES * MAX_MR * MAX_NV * NR
+}
+
 /// Runs a product: tasks are blocks of rows times groups of panels, chosen by the shape alone.
 pub(crate) fn product(ctx: Ctx, p: &Product) {
     let (m, n, k) = (p.m, p.w.n, p.w.k);
@@ -154,6 +160,7 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
     let col_tasks = panels.div_ceil(group);
 
     let scratch = block * (k + nv * NR);
+    assert!(scratch <= working_memory(k), "{scratch} values of working memory for {k} inputs");
     ctx.pool.reserve_scratch(scratch);
     ctx.pool.run(row_tasks * col_tasks, &|task, worker| {
         let first = task / col_tasks * block;

@@ -2,10 +2,10 @@
 //!
 //! The width is fixed so that sums fold the same way everywhere: one register with AVX-512, two with AVX2,
 //! four with NEON, an array in portable code. Every operation is an IEEE basic operation, a fused
-//! multiply-add, a compare-select or a bit shift, so a body written once over [`Simd`] gives the same bits on
+//! multiply-add, a compare-select or a bit shift, so a body written once over `Simd` gives the same bits on
 //! every CPU.
 //!
-//! [`Simd`] is a token: the value exists only inside a `#[target_feature]` entry point, and a [`Vector`] comes only from a
+//! `Simd` is a token: the value exists only inside a `#[target_feature]` entry point, and a `Vector` comes only from a
 //! token, so holding either proves that the CPU has the instructions. Bodies are `#[inline(always)]` into
 //! that entry point; a body that is not inlined loses the instructions and runs tens of times slower.
 
