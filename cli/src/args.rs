@@ -5,11 +5,30 @@
 //! uses them, so that the exit code names the kind of fault (3 input, 5 resources).
 
 use clap::{Args, ValueEnum};
-use sf_formats::{Error, LoadMode};
+use sf_formats::atomic::Overwrite;
+use sf_formats::clip::{Clip, ClipOptions, MixedSizes, Orientation};
+use sf_formats::{Dtype, Error, LoadMode};
 use sf_ops::Kernels;
 use sf_ops::cpu::Isa;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+
+/// How the network runs; shared by the verbs that run it.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct EngineArgs {
+    /// Worker threads, at most 64; 0 takes what affinity and cgroup allow
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=64))]
+    pub(crate) threads: u32,
+    /// Highest instruction set to use: scalar, avx2, avxvnni, avx512, avx512vnni, neon, neondot
+    #[arg(long, value_name = "ISA", value_parser = isa)]
+    pub(crate) isa: Option<Isa>,
+    /// Memory budget of weights, working memory and scene: bytes, or with K, M, G
+    #[arg(long, value_name = "BYTES", value_parser = bytes)]
+    pub(crate) max_mem: Option<u64>,
+    /// How the weight blob is read
+    #[arg(long, value_enum, default_value_t = Load::Map)]
+    pub(crate) load: Load,
+}
 
 /// Worker threads a `--threads` value stands for: 0 is what affinity and cgroup allow, at most 64.
 pub(crate) fn threads(flag: u32) -> usize {
@@ -54,6 +73,25 @@ impl Load {
     }
 }
 
+/// Stored precision of weight matrices.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Precision {
+    /// 32-bit floats
+    F32,
+    /// 16-bit floats, computed in 32 bits
+    F16,
+}
+
+impl Precision {
+    /// As the blob names it.
+    pub(crate) fn dtype(self) -> Dtype {
+        match self {
+            Precision::F32 => Dtype::F32,
+            Precision::F16 => Dtype::F16,
+        }
+    }
+}
+
 /// Image file type of rendered pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Picture {
@@ -86,6 +124,28 @@ impl std::fmt::Display for Size {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}x{}", self.width, self.height)
     }
+}
+
+/// Bytes: a whole number, or one with K, M, G, T (powers of 1024).
+pub(crate) fn bytes(text: &str) -> Result<u64, String> {
+    let (digits, factor) = match text
+        .trim_end_matches(['B', 'b'])
+        .trim_end_matches('i')
+        .split_at_checked(text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len()))
+    {
+        Some((d, "")) => (d, 1u64),
+        Some((d, "k" | "K")) => (d, 1 << 10),
+        Some((d, "m" | "M")) => (d, 1 << 20),
+        Some((d, "g" | "G")) => (d, 1 << 30),
+        Some((d, "t" | "T")) => (d, 1 << 40),
+        _ => return Err("bytes are a number, or one with K, M, G, T, as 512M".into()),
+    };
+    let n: f64 = digits.parse().map_err(|_| "bytes are a number, or one with K, M, G, T, as 512M".to_string())?;
+    let total = n * factor as f64;
+    if total < 1.0 || total > (1u64 << 60) as f64 {
+        return Err("must be between 1 byte and 2^60 bytes".into());
+    }
+    Ok(total as u64)
 }
 
 /// Most times one command takes.
@@ -199,9 +259,70 @@ pub(crate) fn glob(pattern: &str, name: &str) -> bool {
     p[i..].iter().all(|&c| c == b'*')
 }
 
+/// Whether a path's name ends in an extension, in any case.
+pub(crate) fn has_extension(path: &Path, wanted: &[&str]) -> bool {
+    path.extension().and_then(|e| e.to_str()).is_some_and(|e| wanted.iter().any(|w| e.eq_ignore_ascii_case(w)))
+}
+
 /// A path as JSON text; bytes that are not UTF-8 are replaced.
 pub(crate) fn path_json(path: &Path) -> serde_json::Value {
     path.to_string_lossy().into()
+}
+
+/// Which clip, and how it is read.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct ClipArgs {
+    /// Folder of pictures, transforms.json, or a list file with one picture (and time) a line
+    #[arg(short, long, value_name = "CLIP")]
+    pub(crate) input: PathBuf,
+    /// Pictures to use, from 0, as 0,5,10,15; default: all
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    pub(crate) frames: Option<Vec<usize>>,
+    /// Pictures per second, where the clip has no times of its own; default 10
+    #[arg(long, value_name = "FPS")]
+    pub(crate) fps: Option<f64>,
+    /// Seconds of every picture, in place of what the clip says
+    #[arg(long, value_name = "LIST", allow_hyphen_values = true, conflicts_with = "fps")]
+    pub(crate) times: Option<Times>,
+    /// Accept pictures of different sizes
+    #[arg(long)]
+    pub(crate) resize: bool,
+    /// Take pictures as stored, whatever orientation their EXIF data tell
+    #[arg(long)]
+    pub(crate) ignore_orientation: bool,
+}
+
+impl ClipArgs {
+    /// Opens the clip.
+    pub(crate) fn open(&self) -> sf_formats::Result<Clip> {
+        let options = ClipOptions {
+            fps: self.fps,
+            times: self.times.as_ref().map(|t| t.0.clone()),
+            frames: self.frames.clone(),
+            mixed_sizes: if self.resize { MixedSizes::Allow } else { MixedSizes::Refuse },
+            orientation: if self.ignore_orientation { Orientation::Ignore } else { Orientation::Apply },
+            ..ClipOptions::default()
+        };
+        Clip::open(&self.input, &options)
+    }
+}
+
+/// The output file flags of verbs that write one file.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct FileArgs {
+    /// File to write
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: PathBuf,
+    /// Replace an existing file
+    #[arg(long)]
+    pub(crate) force: bool,
+}
+
+impl FileArgs {
+    /// Whether an existing file may be replaced.
+    pub(crate) fn overwrite(&self) -> Overwrite {
+        if self.force { Overwrite::Yes } else { Overwrite::No }
+    }
 }
 
 /// The output folder flags of verbs that write a folder.
@@ -225,6 +346,25 @@ mod tests {
         assert_eq!("0x0".parse::<Size>().unwrap().to_string(), "0x0");
         for bad in ["", "252", "252x", "x168", "-1x5", "252x168x3", "2.5x4", "4294967296x1"] {
             assert!(bad.parse::<Size>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn byte_amounts() {
+        for (text, n) in [
+            ("1", 1),
+            ("512", 512),
+            ("4K", 4096),
+            ("2M", 2 << 20),
+            ("1.5G", 3 << 29),
+            ("2GiB", 2 << 30),
+            ("3MB", 3 << 20),
+            ("1t", 1 << 40),
+        ] {
+            assert_eq!(bytes(text), Ok(n), "{text}");
+        }
+        for bad in ["", "G", "0", "-1", "1Q", "1e30", "nan", "99999999T", "1.2.3", "5 G"] {
+            assert!(bytes(bad).is_err(), "{bad}");
         }
     }
 
@@ -270,5 +410,12 @@ mod tests {
         ] {
             assert_eq!(glob(pattern, name), want, "{pattern} {name}");
         }
+    }
+
+    #[test]
+    fn extensions_ignore_case() {
+        assert!(has_extension(Path::new("a/b.SFW"), &["sfw"]));
+        assert!(!has_extension(Path::new("a.sfw/b"), &["sfw"]));
+        assert!(has_extension(Path::new("x.pt"), &["pth", "pt"]));
     }
 }

@@ -6,12 +6,15 @@
 //! | `output.rs` | results, remarks, output folders that appear whole |
 //! | `progress.rs` | progress bars, on a terminal only |
 //! | `exit.rs` | one-line errors, exit codes, caught panics |
+//! | `network.rs` | presets, configuration files, the model that `run` takes |
+//! | `views.rs` | cameras for `render`: along the clip, fixed, in orbit, displaced |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
 #![deny(unsafe_code)]
 
 mod args;
 mod exit;
+mod network;
 mod output;
 mod progress;
 mod signals;

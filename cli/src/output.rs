@@ -42,6 +42,11 @@ impl Console {
         }
     }
 
+    /// A remark that matters even under `--quiet`.
+    pub(crate) fn warn(&self, line: impl Display) {
+        let _ = writeln!(io::stderr(), "warning: {line}");
+    }
+
     /// A progress bar.
     pub(crate) fn progress(&self, total: u64, what: &'static str) -> Progress {
         Progress::new(total, what, !self.quiet)

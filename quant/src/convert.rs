@@ -119,7 +119,7 @@ fn place(inputs: &[PathBuf]) -> String {
 }
 
 /// Refuses to write over an input (by any name) or over a file that is itself a checkpoint.
-fn refuse_own_input(inputs: &[PathBuf], output: &Path) -> Result<()> {
+pub fn refuse_own_input(inputs: &[PathBuf], output: &Path) -> Result<()> {
     // A path that does not exist cannot be one of the inputs, which do.
     let Ok(target) = output.canonicalize() else { return Ok(()) };
     let same = |input: &PathBuf| input.canonicalize().is_ok_and(|p| p == target) || same_file(input, output);

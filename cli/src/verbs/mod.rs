@@ -1,7 +1,9 @@
 //! One file per verb; each has its arguments and a `run` that joins the crates.
 
+mod convert;
 mod doctor;
 mod export;
+mod init;
 mod inspect;
 mod render;
 mod verify;
@@ -12,6 +14,10 @@ use sf_formats::Result;
 /// What to do.
 #[derive(clap::Subcommand)]
 pub(crate) enum Verb {
+    /// Write a seeded random network as a checkpoint or weight blob
+    Init(init::Args),
+    /// Turn a training checkpoint into a weight blob
+    Convert(convert::Args),
     /// Draw a scene from new places at new times
     Render(render::Args),
     /// Write a scene as files that other tools open
@@ -28,6 +34,8 @@ impl Verb {
     /// Does it.
     pub(crate) fn run(&self, console: &Console) -> Result<()> {
         match self {
+            Verb::Init(args) => init::run(args, console),
+            Verb::Convert(args) => convert::run(args, console),
             Verb::Render(args) => render::run(args, console),
             Verb::Export(args) => export::run(args, console),
             Verb::Inspect(args) => inspect::run(args, console),

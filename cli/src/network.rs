@@ -1,0 +1,131 @@
+//! Which network: presets and configuration files for `init` and `convert`, the model for `run`.
+
+use crate::progress::Progress;
+use clap::ValueEnum;
+use sf_formats::checkpoint::{Checkpoint, CheckpointTensor};
+use sf_formats::error::escape_path;
+use sf_formats::{Error, ModelConfig, Result};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+/// Longest configuration file that is read; a complete one has some 4 kB.
+const CONFIG_CAP: u64 = 1 << 20;
+
+/// A network's sizes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Preset {
+    /// 12 M parameters: demonstrations, tests, small machines
+    Nano,
+    /// 114 M parameters
+    Base,
+    /// 1.1 G parameters, the published size
+    Full,
+    /// Public Pi3: poses and points, no Gaussians, no motion
+    Pi3,
+}
+
+/// Kind of the Gaussian and motion heads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Heads {
+    /// Convolutional pyramid: no seams between patches
+    Dpt,
+    /// Transformer decoder and one linear layer, as Pi3's own heads
+    Linear,
+}
+
+/// The network flags of `init`.
+#[derive(clap::Args, Clone, Debug)]
+pub(crate) struct NetworkArgs {
+    /// Sizes of the network
+    #[arg(long, value_enum, default_value_t = Preset::Nano)]
+    preset: Preset,
+    /// JSON file of settings (flat keys, docs/network.md); what it leaves out is as in base
+    #[arg(long, value_name = "FILE", conflicts_with = "preset")]
+    config: Option<PathBuf>,
+    /// Kind of the Gaussian and motion heads
+    #[arg(long, value_enum)]
+    heads: Option<Heads>,
+}
+
+impl NetworkArgs {
+    /// The configuration, checked.
+    pub(crate) fn config(&self) -> Result<ModelConfig> {
+        let config = match &self.config {
+            Some(file) => read_config(file)?,
+            None => preset(self.preset),
+        };
+        Ok(match self.heads {
+            Some(Heads::Linear) => config.with_linear_heads(),
+            // The presets' own kind.
+            Some(Heads::Dpt) | None => config,
+        })
+    }
+}
+
+/// The configuration of a preset.
+pub(crate) fn preset(preset: Preset) -> ModelConfig {
+    match preset {
+        Preset::Nano => ModelConfig::nano(),
+        Preset::Base => ModelConfig::base(),
+        Preset::Full => ModelConfig::full(),
+        Preset::Pi3 => ModelConfig::pi3(),
+    }
+}
+
+/// Reads a configuration file.
+pub(crate) fn read_config(path: &Path) -> Result<ModelConfig> {
+    let text = read_text(path, CONFIG_CAP)?;
+    ModelConfig::from_json(&text, &escape_path(path))
+}
+
+/// A small text file of at most `cap` bytes.
+pub(crate) fn read_text(path: &Path, cap: u64) -> Result<String> {
+    let fault = |e: &std::io::Error| Error::io(path, "read", e);
+    // Looking before opening: an open of a pipe without a writer would block.
+    if !std::fs::metadata(path).map_err(|e| fault(&e))?.is_file() {
+        return Err(fault(&std::io::Error::other("it is not a regular file")));
+    }
+    let mut bytes = Vec::new();
+    let file = std::fs::File::open(path).map_err(|e| fault(&e))?;
+    file.take(cap + 1).read_to_end(&mut bytes).map_err(|e| fault(&e))?;
+    if bytes.len() as u64 > cap {
+        return Err(Error::input(escape_path(path), format!("longer than {cap} bytes: not such a file")));
+    }
+    String::from_utf8(bytes).map_err(|_| Error::input(escape_path(path), "is not UTF-8 text"))
+}
+
+/// A checkpoint that steps a progress bar with every tensor read.
+pub(crate) struct Watched<'a> {
+    source: &'a dyn Checkpoint,
+    progress: &'a Progress,
+}
+
+impl<'a> Watched<'a> {
+    /// Watches `source`.
+    pub(crate) fn new(source: &'a dyn Checkpoint, progress: &'a Progress) -> Watched<'a> {
+        Watched { source, progress }
+    }
+}
+
+impl Checkpoint for Watched<'_> {
+    fn tensors(&self) -> &[CheckpointTensor] {
+        self.source.tensors()
+    }
+
+    fn read_f32(&self, index: usize, out: &mut Vec<f32>) -> Result<()> {
+        self.progress.step();
+        self.source.read_f32(index, out)
+    }
+
+    fn metadata(&self, key: &str) -> Option<&str> {
+        self.source.metadata(key)
+    }
+
+    fn describe(&self) -> String {
+        self.source.describe()
+    }
+
+    fn digest(&self) -> Result<[u8; 32]> {
+        self.source.digest()
+    }
+}
