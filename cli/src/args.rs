@@ -22,7 +22,7 @@ pub(crate) struct EngineArgs {
     /// Highest instruction set to use: scalar, avx2, avxvnni, avx512, avx512vnni, neon, neondot
     #[arg(long, value_name = "ISA", value_parser = isa)]
     pub(crate) isa: Option<Isa>,
-    /// Memory budget of weights, working memory and scene: bytes, or with K, M, G
+    /// Memory budget of working memory and results: bytes, or with K, M, G; default 8G
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
     pub(crate) max_mem: Option<u64>,
     /// How the weight blob is read

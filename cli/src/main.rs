@@ -7,6 +7,7 @@
 //! | `progress.rs` | progress bars, on a terminal only |
 //! | `exit.rs` | one-line errors, exit codes, caught panics |
 //! | `network.rs` | presets, configuration files, the model that `run` takes |
+//! | `reconstruct.rs` | clip and model to network output |
 //! | `views.rs` | cameras for `render`: along the clip, fixed, in orbit, displaced |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
@@ -17,6 +18,7 @@ mod exit;
 mod network;
 mod output;
 mod progress;
+mod reconstruct;
 mod signals;
 mod verbs;
 mod views;

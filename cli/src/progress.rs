@@ -23,11 +23,6 @@ impl Progress {
     pub(crate) fn step(&self) {
         self.0.inc(1);
     }
-
-    /// The bar stands at `done` steps.
-    pub(crate) fn at(&self, done: u64) {
-        self.0.set_position(done);
-    }
 }
 
 impl Drop for Progress {

@@ -81,3 +81,45 @@ fn p18_an_instruction_set_that_is_not_here() {
     assert_eq!(r.code, 7);
     assert!(error_line(&r.stderr).contains("STREETFORWARD_CPU"));
 }
+
+/// `synth` writes many files for seconds: what stays of it when it cannot finish?
+fn long_synth(out: &std::path::Path) -> Command {
+    let mut c = command(&["synth", "--frames", "400", "--size", "640x360", "-o"]);
+    c.arg(out).stderr(Stdio::piped()).stdout(Stdio::piped());
+    c
+}
+
+#[test]
+fn p17_an_interrupt_is_exit_130_and_leaves_nothing() {
+    for (signal, code) in [("INT", 130), ("TERM", 143)] {
+        let dir = tempfile::tempdir().unwrap();
+        let child = long_synth(&dir.path().join("clip")).spawn().unwrap();
+        // Wait until it writes.
+        for _ in 0..2000 {
+            if !common::files(dir.path()).is_empty() {
+                break;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+        let kill = Command::new("sh").args(["-c", &format!("kill -{signal} {}", child.id())]).status().unwrap();
+        assert!(kill.success());
+        let r = ran(child.wait_with_output().unwrap());
+        assert_eq!(r.code, code, "{}", r.stderr);
+        assert!(error_line(&r.stderr).contains("interrupted"));
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+    }
+}
+
+#[test]
+fn c13_a_file_size_limit_is_exit_6_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("clip");
+    // One block of 512 bytes (1024 in some shells).
+    let script = "ulimit -f 1; exec \"$0\" synth --frames 2 -o \"$1\"";
+    let mut c = Command::new("sh");
+    c.args(["-c", script, env!("CARGO_BIN_EXE_streetforward")]).arg(&out);
+    let r = ran(c.stdin(Stdio::null()).output().unwrap());
+    assert_eq!(r.code, 6, "{}", r.stderr);
+    error_line(&r.stderr);
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+}

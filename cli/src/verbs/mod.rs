@@ -6,6 +6,8 @@ mod export;
 mod init;
 mod inspect;
 mod render;
+mod run;
+mod synth;
 mod verify;
 
 use crate::output::Console;
@@ -18,6 +20,8 @@ pub(crate) enum Verb {
     Init(init::Args),
     /// Turn a training checkpoint into a weight blob
     Convert(convert::Args),
+    /// Turn a clip of pictures into a scene
+    Run(run::Args),
     /// Draw a scene from new places at new times
     Render(render::Args),
     /// Write a scene as files that other tools open
@@ -26,6 +30,8 @@ pub(crate) enum Verb {
     Inspect(inspect::Args),
     /// Check a weight blob: structure and every digest
     Verify(verify::Args),
+    /// Write a synthetic street clip with exact ground truth
+    Synth(synth::Args),
     /// Describe this machine: processor, memory, threads, chosen kernels
     Doctor(doctor::Args),
 }
@@ -36,10 +42,12 @@ impl Verb {
         match self {
             Verb::Init(args) => init::run(args, console),
             Verb::Convert(args) => convert::run(args, console),
+            Verb::Run(args) => run::run(args, console),
             Verb::Render(args) => render::run(args, console),
             Verb::Export(args) => export::run(args, console),
             Verb::Inspect(args) => inspect::run(args, console),
             Verb::Verify(args) => verify::run(args, console),
+            Verb::Synth(args) => synth::run(args, console),
             Verb::Doctor(args) => doctor::run(args, console),
         }
     }
