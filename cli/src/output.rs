@@ -25,14 +25,7 @@ impl Console {
 
     /// The command's result, once: the JSON document or the text.
     pub(crate) fn report(&self, json: &Value, text: &str) -> Result<()> {
-        if self.json {
-            let mut document = serde_json::to_string_pretty(json)
-                .map_err(|e| Error::Internal(format!("the report cannot be written as JSON: {e}")))?;
-            document.push('\n');
-            write_stdout(document.as_bytes())
-        } else {
-            write_stdout(text.as_bytes())
-        }
+        if self.json { write_stdout(json_text(json)?.as_bytes()) } else { write_stdout(text.as_bytes()) }
     }
 
     /// A remark on standard error; a closed standard error is not a fault.
@@ -51,6 +44,14 @@ impl Console {
     pub(crate) fn progress(&self, total: u64, what: &'static str) -> Progress {
         Progress::new(total, what, !self.quiet)
     }
+}
+
+/// A report as indented JSON text.
+pub(crate) fn json_text(json: &Value) -> Result<String> {
+    let mut text = serde_json::to_string_pretty(json)
+        .map_err(|e| Error::Internal(format!("the report cannot be written as JSON: {e}")))?;
+    text.push('\n');
+    Ok(text)
 }
 
 /// Writes to standard output; lost output is an error (closed, full, reader gone).

@@ -137,7 +137,7 @@ pub(crate) fn prepare_clip(
     let frames: Vec<SourceFrame> = clip
         .frames
         .iter()
-        .map(|f| SourceFrame { width: f.image.width, height: f.image.height, rgb: &f.image.data })
+        .map(|f| SourceFrame { name: &f.name, width: f.image.width, height: f.image.height, rgb: &f.image.data })
         .collect();
     prepare(config, &frames, &clip.times(), k, size)
 }

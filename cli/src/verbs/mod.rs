@@ -1,7 +1,9 @@
 //! One file per verb; each has its arguments and a `run` that joins the crates.
 
 mod convert;
+mod demo;
 mod doctor;
+mod eval;
 mod export;
 mod init;
 mod inspect;
@@ -16,6 +18,8 @@ use sf_formats::Result;
 /// What to do.
 #[derive(clap::Subcommand)]
 pub(crate) enum Verb {
+    /// Show everything on a synthetic street
+    Demo(demo::Args),
     /// Write a seeded random network as a checkpoint or weight blob
     Init(init::Args),
     /// Turn a training checkpoint into a weight blob
@@ -30,6 +34,8 @@ pub(crate) enum Verb {
     Inspect(inspect::Args),
     /// Check a weight blob: structure and every digest
     Verify(verify::Args),
+    /// Measure a model against clips with ground truth
+    Eval(eval::Args),
     /// Write a synthetic street clip with exact ground truth
     Synth(synth::Args),
     /// Describe this machine: processor, memory, threads, chosen kernels
@@ -40,6 +46,7 @@ impl Verb {
     /// Does it.
     pub(crate) fn run(&self, console: &Console) -> Result<()> {
         match self {
+            Verb::Demo(args) => demo::run(args, console),
             Verb::Init(args) => init::run(args, console),
             Verb::Convert(args) => convert::run(args, console),
             Verb::Run(args) => run::run(args, console),
@@ -47,6 +54,7 @@ impl Verb {
             Verb::Export(args) => export::run(args, console),
             Verb::Inspect(args) => inspect::run(args, console),
             Verb::Verify(args) => verify::run(args, console),
+            Verb::Eval(args) => eval::run(args, console),
             Verb::Synth(args) => synth::run(args, console),
             Verb::Doctor(args) => doctor::run(args, console),
         }

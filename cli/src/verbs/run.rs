@@ -14,7 +14,7 @@
 //! ```
 
 use crate::args::{ClipArgs, EngineArgs, FolderArgs, Precision, Size, path_json};
-use crate::output::{Console, OutputFolder, files_json, human_count};
+use crate::output::{Console, OutputFolder, files_json, human_count, json_text};
 use crate::reconstruct::{self, Loaded};
 use clap::ValueEnum;
 use serde_json::{Value, json};
@@ -180,9 +180,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         "depth_png_steps_per_unit": DEPTH_STEPS,
         "output_digest": hex(&reconstruct::output_digest(out)),
     });
-    let text = serde_json::to_string_pretty(&report)
-        .map_err(|e| Error::Internal(format!("the report cannot be written as JSON: {e}")))?;
-    atomic::write(&folder.path().join("run.json"), (text + "\n").as_bytes(), Overwrite::Yes)?;
+    atomic::write(&folder.path().join("run.json"), json_text(&report)?.as_bytes(), Overwrite::Yes)?;
     let files = folder.commit()?;
     let stage_files = stages.map(OutputFolder::commit).transpose()?;
     report["files"] = files_json(&files);

@@ -2,8 +2,9 @@
 #![allow(dead_code, unreachable_pub, reason = "each test file uses a part of it")]
 
 use serde_json::Value;
+use sf_formats::Dtype;
 use sf_formats::config::{Head, ModelConfig, Trunk};
-use sf_formats::{BlobWriter, Dtype, Meta};
+use sf_quant::{Options, Outputs, Seeded, convert_to_bytes};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -117,7 +118,7 @@ pub fn tiny_config() -> ModelConfig {
     let nano = ModelConfig::nano();
     ModelConfig {
         encoder: Trunk { dim: 16, depth: 1, heads: 2, registers: 1, ..nano.encoder },
-        pos_grid: 3,
+        pos_grid: 4,
         aa: Trunk { dim: 16, depth: 2, heads: 2, registers: 1, ..nano.aa },
         camera_dim: 16,
         camera_depth: 1,
@@ -134,13 +135,8 @@ pub fn tiny_config() -> ModelConfig {
     }
 }
 
-/// A valid blob of [`tiny_config`]; its values are a ramp.
+/// A valid blob of [`tiny_config`] with random weights.
 pub fn tiny_blob() -> Vec<u8> {
-    let mut writer = BlobWriter::in_memory(&tiny_config(), &Meta::new()).unwrap();
-    let lengths: Vec<usize> = writer.specs().iter().map(|s| s.len()).collect();
-    for n in lengths {
-        let values: Vec<f32> = (0..n).map(|i| (i % 17) as f32 * 0.01 - 0.08).collect();
-        writer.write(&values, Dtype::F32).unwrap();
-    }
-    writer.finish_bytes().unwrap()
+    let seeded = Seeded::new(&tiny_config(), 7, Outputs::Random).unwrap();
+    convert_to_bytes(&seeded, &Options::to(Dtype::F32)).unwrap()
 }

@@ -1,0 +1,91 @@
+//! `synth`, `eval` and `demo`: synthetic streets from drawing to judging.
+
+mod common;
+
+use common::{fails, files, ok, ok_json, tiny_blob};
+use sf_formats::clip::{Clip, ClipOptions, GroundTruth};
+use std::fs;
+use std::path::Path;
+
+fn s(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn a_synthetic_clip_is_complete_and_reproducible() {
+    let dir = tempfile::tempdir().unwrap();
+    let (a, b) = (dir.path().join("a"), dir.path().join("b"));
+    let json = ok_json(&["synth", "--seed", "5", "--frames", "3", "--size", "84x56", "-o", s(&a)]);
+    // Three pictures, depths, velocities and masks, and transforms.json.
+    assert_eq!(json["files"].as_array().unwrap().len(), 13);
+    let clip = Clip::open(&a, &ClipOptions::default()).unwrap();
+    assert_eq!((clip.frames.len(), clip.frames[0].image.size()), (3, (84, 56)));
+    assert_eq!(clip.times(), [0.0, 0.1, 0.2]);
+    assert!(clip.poses.is_some() && clip.intrinsics.is_some());
+    let truth = GroundTruth::load(&a, &[0, 1, 2]).unwrap().unwrap();
+    assert!(truth.frames[2].depth.iter().any(|&d| d > 0.0) && truth.frames[2].velocity.is_some());
+    ok(&["synth", "--seed", "5", "--frames", "3", "--size", "84x56", "-o", s(&b)]);
+    for file in files(&a) {
+        assert_eq!(fs::read(a.join(&file)).unwrap(), fs::read(b.join(&file)).unwrap(), "{}", file.display());
+    }
+}
+
+#[test]
+fn synth_refuses_what_makes_no_clip() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    for bad in [&["--frames", "0"][..], &["--size", "0x0"], &["--fps", "0"], &["--fps", "nan"], &["--seed", "-1"]] {
+        fails(2, &[&["synth", "-o", s(&out)], bad].concat());
+        assert!(!out.exists());
+    }
+    fs::create_dir(&out).unwrap();
+    fs::write(out.join("mine"), b"x").unwrap();
+    fails(6, &["synth", "-o", s(&out)]);
+}
+
+#[test]
+fn eval_reports_the_model_and_the_trivial_alternatives() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("tiny.sfw");
+    fs::write(&model, tiny_blob()).unwrap();
+    let clips: Vec<_> = [1, 2].map(|seed| dir.path().join(format!("clip{seed}"))).into();
+    for (seed, clip) in ["1", "2"].iter().zip(&clips) {
+        ok(&["synth", "--seed", seed, "--frames", "8", "--size", "56x42", "-o", s(clip)]);
+    }
+    let args = ["eval", "-m", s(&model), "--data", s(&clips[0]), s(&clips[1])];
+    let json = ok_json(&args);
+    assert_eq!((json["clips"].as_u64(), json["data"].as_array().unwrap().len()), (Some(2), 2));
+    for key in ["psnr_full_db", "ssim_full", "depth_rmse_full", "velocity_epe"] {
+        assert!(json[key].is_number(), "{key}: {}", json[key]);
+    }
+    // A copy of the nearest picture shows the street, untrained weights do not.
+    let copy = json["baselines"]["copy_nearest"]["psnr_full_db"].as_f64().unwrap();
+    assert!(copy > json["psnr_full_db"].as_f64().unwrap() && copy > 10.0, "{copy}");
+    assert!(json["ablations"]["static_only"]["psnr_full_db"].is_number());
+    assert!(ok(&args).contains("| frames | method |"));
+    ok(&[&args[..], &["--target-poses", "aligned-truth"]].concat());
+    fails(2, &["eval", "-m", s(&model)]);
+    fails(6, &["eval", "-m", s(&model), "--data", "/nonexistent"]);
+}
+
+#[test]
+fn the_demo_runs_in_any_folder() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("tiny.sfw");
+    fs::write(&model, tiny_blob()).unwrap();
+    let out = dir.path().join("demo");
+    let r = common::ran(
+        common::command(&["demo", "-m", "tiny.sfw", "-o", "demo"]).current_dir(dir.path()).output().unwrap(),
+    );
+    assert_eq!(r.code, 0, "{}", r.stderr);
+    assert!(r.stdout.contains("demo/overview.png") && r.stdout.contains("network"), "{}", r.stdout);
+    assert!(!r.stdout.contains("random"), "{}", r.stdout);
+    for file in ["overview.png", "novel/000019.png", "aside/000000.png", "orbit/000035.png", "scene/scene.ply"] {
+        assert!(out.join(file).exists(), "{file}");
+    }
+    let json: serde_json::Value = serde_json::from_slice(&fs::read(out.join("demo.json")).unwrap()).unwrap();
+    assert_eq!(json["schema"], "streetforward.demo/1");
+    assert!(json["run_ms"].as_f64().unwrap() > 0.0 && json["eval"]["psnr_full_db"].is_number());
+    ok(&["render", "-s", s(&out.join("scene")), "-o", s(&dir.path().join("again")), "--times", "0.3"]);
+    ok(&["eval", "-m", s(&model), "--data", s(&out.join("clip"))]);
+}
