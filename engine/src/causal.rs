@@ -178,6 +178,7 @@ impl Pass<'_> {
             tables: self.tables,
             dpt: self.tables.motion.as_ref(),
             head,
+            tokens: Tokens::Patches,
             name: "motion",
         };
         let features = |data| Features::dense(data, dim, d, self.mask.tokens);

@@ -14,7 +14,7 @@ use crate::model::{DenseHead, Model};
 use crate::output::{Flags, Output};
 use crate::plan::{ClipShape, Plan, trunk_lens};
 use crate::probe::Probe;
-use crate::tables::{DptTables, Tables};
+use crate::tables::{DptTables, Tables, Tokens};
 use crate::unproject::{self, View};
 use crate::{causal, encoder, gaussians, motion};
 use sf_formats::config::{Concat, DepthMap, ModelConfig, MotionLayout};
@@ -121,24 +121,25 @@ impl Forward<'_> {
     }
 
     /// A dense head on the aggregator and what it reads.
-    fn dense<'p>(&'p self, name: &'static str, head: &'p DenseHead, pairs: Pairs<'p>) -> (Dense<'p>, Source<'p>) {
-        let tables: Option<&DptTables> = match name {
-            "depth" => self.tables.depth.as_ref(),
-            "conf" => self.tables.conf.as_ref(),
-            _ => self.tables.gs.as_ref(),
-        };
+    fn dense<'p>(
+        &'p self,
+        name: &'static str,
+        head: &'p DenseHead,
+        dpt: Option<&'p DptTables>,
+        pairs: Pairs<'p>,
+    ) -> (Dense<'p>, Source<'p>) {
         let source = match head {
             DenseHead::Linear(_) => Source::Tokens(self.last(pairs)),
             DenseHead::Dpt(dpt) => Source::Taps(dpt.taps.map(|t| pairs.get(t))),
         };
-        let dense = Dense { net: self.net, dims: &self.plan.dims, tables: self.tables, dpt: tables, head, name };
-        (dense, source)
+        let (net, dims, tables) = (self.net, &self.plan.dims, self.tables);
+        (Dense { net, dims, tables, dpt, head, tokens: Tokens::WithRegisters, name }, source)
     }
 
     /// Local points and depth, in the network's units until [`Forward::place`].
     fn depth(&self, pairs: Pairs, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
         let d = &self.plan.dims;
-        let (dense, source) = self.dense("depth", &self.net.model.weights().depth, pairs);
+        let (dense, source) = self.dense("depth", &self.net.model.weights().depth, self.tables.depth.as_ref(), pairs);
         dense.prepare(source, work, probe)?;
         let pool = self.net.ctx.pool;
         for f in 0..d.frames {
@@ -173,7 +174,7 @@ impl Forward<'_> {
     fn confidence(&self, pairs: Pairs, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
         let d = &self.plan.dims;
         if let Some(head) = &self.net.model.weights().conf {
-            let (dense, source) = self.dense("conf", head, pairs);
+            let (dense, source) = self.dense("conf", head, self.tables.conf.as_ref(), pairs);
             dense.prepare(source, work, probe)?;
             for (f, conf) in out.conf.chunks_exact_mut(d.pixels()).enumerate() {
                 dense.frame(source, f, work, conf);
@@ -236,7 +237,7 @@ impl Forward<'_> {
             probe.lap("gaussians");
             return Ok(());
         };
-        let (dense, source) = self.dense("gs", head, pairs);
+        let (dense, source) = self.dense("gs", head, self.tables.gs.as_ref(), pairs);
         let need = heads::scratch_len(head, d, d.tokens, self.net.ctx.pool.threads());
         let [raw, work] = carve(work, [d.pixels() * gaussians::CHANNELS, need]);
         dense.prepare(source, work, probe)?;

@@ -25,9 +25,12 @@ pub(crate) fn scratch_len(head: &LinearHead, d: &Dims, tokens: usize, threads: u
     carved_len(lens(head, d, tokens, threads))
 }
 
-/// Tokens per frame and their kind: the causal module's decoder runs on patches alone.
-fn tokens(dense: &Dense, x: &Features) -> (usize, Tokens) {
-    if dense.name == "motion" { (dense.dims.patches, Tokens::Patches) } else { (x.tokens(), Tokens::WithRegisters) }
+/// Decoder tokens per frame.
+fn per_frame(dense: &Dense, x: &Features) -> usize {
+    match dense.tokens {
+        Tokens::WithRegisters => x.tokens(),
+        Tokens::Patches => dense.dims.patches,
+    }
 }
 
 pub(crate) fn prepare(
@@ -37,9 +40,8 @@ pub(crate) fn prepare(
     scratch: &mut [f32],
     probe: &mut Probe,
 ) -> Result<()> {
-    let (per_frame, kind) = tokens(dense, &x);
-    let [decoded, work] = carve(scratch, lens(head, dense.dims, per_frame, dense.net.ctx.pool.threads()));
-    let job = decoder::Job { name: dense.name, x, tokens: kind };
+    let [decoded, work] = carve(scratch, lens(head, dense.dims, per_frame(dense, &x), dense.net.ctx.pool.threads()));
+    let job = decoder::Job { name: dense.name, x, tokens: dense.tokens };
     decoder::run(dense.net, &head.decoder, (dense.dims, dense.tables), job, (work, decoded), probe)
 }
 
@@ -50,7 +52,7 @@ pub(crate) fn frame(
     (frame, scratch, out): (usize, &mut [f32], &mut [f32]),
 ) {
     let d = dense.dims;
-    let (per_frame, _) = tokens(dense, &x);
+    let per_frame = per_frame(dense, &x);
     let [decoded, work] = carve(scratch, lens(head, d, per_frame, dense.net.ctx.pool.threads()));
     let width = head.decoder.linear_out.weight.n;
     let patches = &decoded[((frame + 1) * per_frame - d.patches) * width..][..d.patches * width];

@@ -20,7 +20,7 @@ use crate::block::Net;
 use crate::model::DenseHead;
 use crate::plan::Dims;
 use crate::probe::Probe;
-use crate::tables::{DptTables, Tables};
+use crate::tables::{DptTables, Tables, Tokens};
 use sf_formats::Result;
 
 /// What a dense head reads.
@@ -39,6 +39,8 @@ pub(crate) struct Dense<'a> {
     pub(crate) tables: &'a Tables,
     pub(crate) dpt: Option<&'a DptTables>,
     pub(crate) head: &'a DenseHead,
+    /// Which tokens a decoder runs on.
+    pub(crate) tokens: Tokens,
     pub(crate) name: &'static str,
 }
 
