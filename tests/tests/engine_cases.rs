@@ -2,13 +2,14 @@
 //! S15 of the list of bad inputs; known intrinsics; cancellation.
 
 use sf_formats::blob::Dtype;
+use sf_formats::clip::{Clip, ClipOptions};
 use sf_formats::config::{Extrapolate, Head, ModelConfig};
 use sf_formats::{Intrinsics, Status};
 use sf_tests::tiny::{Frames, model, session, stages, tensors, tiny};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
-use streetforward::{ClipShape, Input, Options, Session};
+use streetforward::{ClipShape, Input, Options, Prepared, Session};
 
 #[test]
 fn i14_one_frame_stands_still() {
@@ -229,4 +230,26 @@ fn p16_the_host_control_word_changes_nothing() {
     set(0x1f80);
     assert_eq!(mode, odd);
     assert_eq!(plain, other);
+}
+
+#[test]
+fn a_real_drive_is_brought_to_size_and_run() {
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("data/drive");
+    let options = ClipOptions { frames: Some(vec![0, 5, 10]), fps: Some(12.5), ..ClipOptions::default() };
+    let clip = Clip::open(&folder, &options).unwrap();
+    let config = tiny();
+    let (w, h) = clip.frames[0].image.size();
+    let natural = Prepared::from_clip(&config, &clip, None).unwrap().shape;
+    assert!(natural.width % 14 == 0 && natural.width * natural.height <= 255_000);
+    let (have, want) = (natural.width as f64 / natural.height as f64, f64::from(w) / f64::from(h));
+    assert!((have / want - 1.0).abs() < 0.05, "{have} for {want}");
+
+    let clip = Prepared::from_clip(&config, &clip, Some((84, 42))).unwrap();
+    assert_eq!((clip.sources.len(), clip.sources[0].size), (3, (w, h)));
+    let model = model(&config, &tensors(&config, 12), Dtype::F32);
+    let mut session = session(&model, clip.shape);
+    let scene = session.run(&clip.input()).unwrap().to_scene(&config, &clip.sources);
+    assert_eq!((scene.len(), scene.frames.len()), (3 * 84 * 42, 3));
+    assert!((scene.frames[2].time - scene.frames[0].time - 0.8).abs() < 1e-9, "{:?}", scene.frames);
+    scene.frames.iter().for_each(|f| f.camera.check(&f.name).unwrap());
 }
