@@ -240,7 +240,7 @@ fn a_real_drive_is_brought_to_size_and_run() {
     let config = tiny();
     let (w, h) = clip.frames[0].image.size();
     let natural = Prepared::from_clip(&config, &clip, None).unwrap().shape;
-    assert!(natural.width % 14 == 0 && natural.width * natural.height <= 255_000);
+    assert!(natural.width.is_multiple_of(14) && natural.width * natural.height <= 255_000);
     let (have, want) = (natural.width as f64 / natural.height as f64, f64::from(w) / f64::from(h));
     assert!((have / want - 1.0).abs() < 0.05, "{have} for {want}");
 
