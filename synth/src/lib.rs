@@ -14,6 +14,18 @@
 //!
 //! Everything is a function of the seed and the options alone: no platform mathematics, no clocks, and
 //! threads only split whole frames and clips.
+//!
+//! ```
+//! use sf_synth::{Options, Split, Street};
+//!
+//! let seed = Split::HeldOut.seeds(0).next().unwrap();
+//! let street = Street::new(seed, Options { width: 126, height: 84, ..Options::default() })?;
+//! let frame = street.frame(3);
+//! let centre = 42 * 126 + 63;
+//! let point = frame.camera.unproject(63.5, 42.5, f64::from(frame.depth[centre]));
+//! assert!(point.is_finite() && frame.rgb.len() == 3 * 126 * 84);
+//! # Ok::<(), sf_formats::Error>(())
+//! ```
 #![deny(unsafe_code)]
 
 mod body;
