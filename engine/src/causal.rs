@@ -17,7 +17,7 @@ use crate::plan::Dims;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens, causal_tokens};
 use sf_formats::Result;
-use sf_formats::config::{Concat, ModelConfig, MotionLayout};
+use sf_formats::config::{Concat, Extrapolate, ModelConfig, MotionLayout};
 use sf_ops::attention::FrameMask;
 use sf_ops::mat::Mat;
 
@@ -92,7 +92,9 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
     for ((name, reach, blocks), raw) in passes.into_iter().zip(job.raw.chunks_exact_mut(map_len)) {
         let Some(reach) = reach else { continue };
         x.copy_from_slice(start);
-        let pass = Pass { net, d, tables, mask: mask(config, d, reach), blocks, name };
+        // A direction without a neighbour mirrors the other one: its map is never read, so only a tap wants it.
+        let unread = config.render_extrapolate == Extrapolate::Mirror && bwd.is_some() && !probe.tapped();
+        let pass = Pass { net, d, tables, mask: mask(config, d, reach), blocks, reach, unread, name };
         let shared = w.causal_back.is_none().then_some(&*shared);
         pass.layers(shared, x, tapped, scratch, probe)?;
         pass.motion(x, tapped, scratch, raw, probe)?;
@@ -132,6 +134,9 @@ struct Pass<'a> {
     tables: &'a Tables,
     mask: FrameMask,
     blocks: &'a [Block],
+    reach: Reach,
+    /// Whether maps of frames without a neighbour in this direction go unread.
+    unread: bool,
     name: &'static str,
 }
 
@@ -195,6 +200,9 @@ impl Pass<'_> {
         dense.prepare(source, scratch, probe)?;
         let out = heads::channels(head);
         for (f, map) in raw.chunks_exact_mut(d.pixels() * out).enumerate() {
+            if self.unread && !self.reach.has_neighbour(f, d.frames) {
+                continue;
+            }
             dense.frame(source, f, scratch, map);
             probe.guard(format_args!("motion.{}", self.name), map)?;
             probe.emit(format_args!("motion.{}", self.name), Some(f), &[d.height, d.width, out], map);

@@ -57,6 +57,8 @@ pub struct Session {
     tables: Tables,
     arena: Arena,
     memory: Memory,
+    /// Whether `memory.output` is a whole result.
+    complete: bool,
     cancel: Arc<AtomicBool>,
     times: [Duration; STAGES.len()],
 }
@@ -85,7 +87,18 @@ impl Session {
         let memory = Memory::new(&model, shape)?;
         let tables = Tables::new(&model, &plan.dims);
         let cancel = Arc::new(AtomicBool::new(false));
-        Ok(Session { model, pool, kernels, plan, tables, arena, memory, cancel, times: Default::default() })
+        Ok(Session {
+            model,
+            pool,
+            kernels,
+            plan,
+            tables,
+            arena,
+            memory,
+            complete: false,
+            cancel,
+            times: Default::default(),
+        })
     }
 
     /// Sizes and memory.
@@ -146,12 +159,18 @@ impl Session {
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
         let mut probe = Probe::new(taps, &self.cancel, deadline, &mut self.times);
+        self.complete = false;
         forward.run(Areas { pairs, motion, work }, &mut self.memory, &mut probe)?;
+        self.complete = true;
         Ok(&self.memory.output)
     }
 
-    /// Result of the last successful run.
+    /// Result of the last run.
+    ///
+    /// # Panics
+    /// When there was none, or it failed: a result is whole or absent.
     pub fn output(&self) -> &Output {
+        assert!(self.complete, "no complete result: the session has not run, or its last run failed");
         &self.memory.output
     }
 }

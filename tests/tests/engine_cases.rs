@@ -232,6 +232,37 @@ fn p16_the_host_control_word_changes_nothing() {
     assert_eq!(plain, other);
 }
 
+/// Frames whose motion map nobody reads are skipped, unless a tap looks.
+#[test]
+fn taps_change_no_result() {
+    for extrapolate in [Extrapolate::Mirror, Extrapolate::Direct] {
+        for motion in [tiny().motion, Head::xdec_linear(4, 16, 1, 2)] {
+            let config = ModelConfig { render_extrapolate: extrapolate, motion, ..tiny() };
+            let model = model(&config, &tensors(&config, 13), Dtype::F32);
+            let (clip, other) = (Frames::new(3, 28, 42, 13), Frames::new(3, 28, 42, 14));
+            let mut session = session(&model, clip.shape);
+            let mut count = 0;
+            let tapped = session.run_watched(&clip.input(), None, Some(&mut |_| count += 1)).unwrap().clone();
+            assert!(count > 50);
+            session.run(&other.input()).unwrap();
+            assert_eq!(*session.run(&clip.input()).unwrap(), tapped);
+        }
+    }
+}
+
+#[test]
+#[should_panic(expected = "no complete result")]
+fn a_failed_run_leaves_no_result() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 15), Dtype::F32);
+    let clip = Frames::new(1, 28, 42, 15);
+    let mut session = session(&model, clip.shape);
+    session.run(&clip.input()).unwrap();
+    session.cancel_flag().store(true, Ordering::Relaxed);
+    session.run(&clip.input()).unwrap_err();
+    session.output();
+}
+
 #[test]
 fn a_real_drive_is_brought_to_size_and_run() {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("data/drive");
