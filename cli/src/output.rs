@@ -54,14 +54,37 @@ pub(crate) fn json_text(json: &Value) -> Result<String> {
     Ok(text)
 }
 
-/// Writes to standard output; lost output is an error (closed, full, reader gone).
-pub(crate) fn write_stdout(bytes: &[u8]) -> Result<()> {
-    let at = Path::new("standard output");
-    if signals::stdout_closed() {
-        return Err(Error::io(at, "write", &io::Error::other("it is closed")));
+/// Standard output; lost output is an error (closed, full, reader gone).
+pub(crate) struct Stdout(io::StdoutLock<'static>);
+
+impl Stdout {
+    /// Fails when it was closed from the start.
+    pub(crate) fn open() -> Result<Stdout> {
+        if signals::stdout_closed() {
+            return Err(stdout_error(&io::Error::other("it is closed")));
+        }
+        Ok(Stdout(io::stdout().lock()))
     }
-    let mut out = io::stdout().lock();
-    out.write_all(bytes).and_then(|()| out.flush()).map_err(|e| Error::io(at, "write", &e))
+}
+
+impl Write for Stdout {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+fn stdout_error(e: &io::Error) -> Error {
+    Error::io(Path::new("standard output"), "write", e)
+}
+
+/// Writes all bytes to standard output.
+pub(crate) fn write_stdout(bytes: &[u8]) -> Result<()> {
+    let mut out = Stdout::open()?;
+    out.write_all(bytes).and_then(|()| out.flush()).map_err(|e| stdout_error(&e))
 }
 
 /// A folder being written: files go into a temporary folder, [`OutputFolder::commit`] makes them

@@ -31,6 +31,29 @@ fn a_synthetic_clip_is_complete_and_reproducible() {
 }
 
 #[test]
+fn a_stream_of_clips_goes_to_standard_output() {
+    let args = ["synth", "--stream", "3", "--seed", "10", "--size", "28x28"];
+    let out = common::command(&args).output().unwrap();
+    assert_eq!((out.status.code(), out.stderr.len()), (Some(0), 0));
+    let seed_at = |at: usize| u64::from_le_bytes(out.stdout[at + 8..at + 16].try_into().unwrap());
+    let (mut at, mut seeds) = (0, Vec::new());
+    while at < out.stdout.len() {
+        assert_eq!(&out.stdout[at..at + 8], b"SFSYNTH1");
+        seeds.push(seed_at(at));
+        at += 64 + u32::from_le_bytes(out.stdout[at + 16..at + 20].try_into().unwrap()) as usize;
+    }
+    let want: Vec<u64> = sf_synth::Split::Train.seeds(10).take(3).collect();
+    assert_eq!((at, seeds), (out.stdout.len(), want));
+    fails(2, &["synth", "--stream", "3", "-o", "x"]);
+    fails(2, &["synth", "--stream", "3", "--json"]);
+    fails(2, &["synth"]);
+    // The reader is gone.
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    assert_eq!(common::ran(common::command(&args).stdout(writer).output().unwrap()).code, 6);
+}
+
+#[test]
 fn synth_refuses_what_makes_no_clip() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

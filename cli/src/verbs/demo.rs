@@ -5,7 +5,8 @@
 //! network; the other 16 judge what comes out.
 //!
 //! ```text
-//! DIR/overview.png        per context frame: picture, depth, motion, dynamic probability
+//! DIR/overview.png        per context frame: picture, depth and true depth, motion and true motion, dynamic
+//!                         probability
 //! DIR/novel/*.png         the street at all 20 times, 16 of them never seen
 //! DIR/aside/*.png         the same from a metre to the right
 //! DIR/orbit/*.png         time stands still, the camera circles
@@ -25,7 +26,7 @@ use serde_json::json;
 use sf_eval::{EvalClip, EvalOptions, Protocol, evaluate};
 use sf_formats::atomic::{self, Overwrite};
 use sf_formats::camera_json::TimedCamera;
-use sf_formats::clip::{Clip, ClipOptions, GroundTruth};
+use sf_formats::clip::{Clip, ClipOptions, GroundTruth, TruthFrame};
 use sf_formats::error::escape_path;
 use sf_formats::{Result, Scene, image_io};
 use sf_splat::{RenderOptions, Renderer};
@@ -42,7 +43,7 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "MODEL")]
     model: Option<PathBuf>,
     /// The street; a seed that models may be trained on gives way to the next that they may not
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 4)]
     seed: u64,
     #[command(flatten)]
     engine: EngineArgs,
@@ -80,7 +81,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let mut scene = out.to_scene(config, &reconstruct::sources(&context));
     scene.notes = run::notes(&loaded, &PathBuf::from(format!("synthetic street {seed}")));
     scene.save(&folder.subfolder("scene")?, Overwrite::Yes)?;
-    let overview = Results { out, scene: &scene, prepared: &prepared }.overview();
+    let known: Vec<TruthFrame> = match &truth {
+        Some(t) => protocol.context.iter().map(|&i| t.frames[i].clone()).collect(),
+        None => Vec::new(),
+    };
+    let overview = Results { out, scene: &scene, prepared: &prepared, truth: &known }.overview();
     image_io::write_png(&folder.path().join("overview.png"), &overview, Overwrite::Yes)?;
 
     let mut renderer = Renderer::new(session.threads())?;
@@ -135,7 +140,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     ));
     text.push_str(&scores.to_markdown());
     text.push_str(&format!(
-        "\nLook at {shown}/overview.png   picture, depth, motion, dynamic probability\n        \
+        "\nLook at {shown}/overview.png   picture, depth, true depth, motion, true motion, dynamic probability\n        \
          {shown}/novel/         the street at 20 times, 16 of them never seen\n        \
          {shown}/aside/         the same from {ASIDE} unit to the right\n        \
          {shown}/orbit/         time stands still, the camera circles\n        \

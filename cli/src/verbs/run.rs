@@ -19,7 +19,7 @@ use crate::reconstruct::{self, Loaded};
 use clap::ValueEnum;
 use serde_json::{Value, json};
 use sf_formats::atomic::{self, Overwrite};
-use sf_formats::clip::Clip;
+use sf_formats::clip::{Clip, TruthFrame};
 use sf_formats::digest::hex;
 use sf_formats::error::escape_path;
 use sf_formats::image_io::{self, Rgb8};
@@ -159,7 +159,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     }
     let mut scene = out.to_scene(config, &reconstruct::sources(&clip));
     scene.notes = notes(&loaded, &args.clip.input);
-    write_results(args, &folder, &Results { out, scene: &scene, prepared: &prepared })?;
+    write_results(args, &folder, &Results { out, scene: &scene, prepared: &prepared, truth: &[] })?;
 
     let mut report = json!({
         "schema": "streetforward.run/1",
@@ -241,6 +241,8 @@ pub(crate) struct Results<'a> {
     pub(crate) out: &'a Output,
     pub(crate) scene: &'a Scene,
     pub(crate) prepared: &'a Prepared,
+    /// Ground truth of the frames, where it is known at the network's size.
+    pub(crate) truth: &'a [TruthFrame],
 }
 
 impl Results<'_> {
@@ -258,20 +260,30 @@ impl Results<'_> {
         both.map(|(f, b)| std::array::from_fn(|a| 0.5 * (f[a] - b[a]))).collect()
     }
 
-    /// A row per frame: picture, depth, motion, dynamic probability.
+    /// A row per frame: picture, depth, true depth, motion, true motion, dynamic probability; without ground
+    /// truth four of them. Predicted and true depth have scales of their own, since a clip without poses
+    /// is known up to scale; motion has one, since it is to be compared.
     pub(crate) fn overview(&self) -> Rgb8 {
         let (out, size, n) = (self.out, self.size(), self.pixels());
         let (scale, velocity) = (DepthScale::of(&out.depth), self.velocity());
-        let top = picture::top_speed(&velocity, 1.0);
+        let moving: Vec<[f32; 3]> =
+            self.truth.iter().filter_map(|t| t.velocity.as_deref()).flatten().copied().collect();
+        let top = picture::top_speed(if moving.is_empty() { &velocity } else { &moving }, 1.0);
+        let truth: Vec<f32> = self.truth.iter().flat_map(|t| &t.depth).copied().collect();
+        let true_scale = DepthScale::of(&truth);
         let mut cells = Vec::new();
         for f in 0..out.shape.frames {
             let range = f * n..(f + 1) * n;
             cells.push(Rgb8::new(size.0, size.1, self.prepared.images[3 * f * n..3 * (f + 1) * n].to_vec()));
+            let truth = self.truth.get(f).filter(|t| (t.width, t.height) == size);
             cells.push(picture::depth_colours(&out.depth[range.clone()], size, scale));
+            cells.extend(truth.map(|t| picture::depth_colours(&t.depth, size, true_scale)));
             cells.push(picture::velocity_wheel(&velocity[range.clone()], size, top));
+            cells.extend(truth.and_then(|t| t.velocity.as_ref()).map(|v| picture::velocity_wheel(v, size, top)));
             cells.push(picture::gray(&out.dynamic[range], size, (0.0, 1.0)));
         }
-        picture::grid(&cells.iter().collect::<Vec<_>>(), 4)
+        let columns = cells.len() / out.shape.frames;
+        picture::grid(&cells.iter().collect::<Vec<_>>(), columns)
     }
 }
 
