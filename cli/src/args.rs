@@ -17,16 +17,16 @@ use std::str::FromStr;
 #[derive(Args, Clone, Debug)]
 pub(crate) struct EngineArgs {
     /// Worker threads, at most 64; 0 takes what affinity and cgroup allow
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=64))]
+    #[arg(help_heading = "Engine", long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u32).range(0..=64))]
     pub(crate) threads: u32,
     /// Highest instruction set to use: scalar, avx2, avxvnni, avx512, avx512vnni, neon, neondot
-    #[arg(long, value_name = "ISA", value_parser = isa)]
+    #[arg(help_heading = "Engine", long, value_name = "ISA", value_parser = isa)]
     pub(crate) isa: Option<Isa>,
     /// Memory budget of working memory and results: bytes, or with K, M, G; default 8G
-    #[arg(long, value_name = "BYTES", value_parser = bytes)]
+    #[arg(help_heading = "Engine", long, value_name = "BYTES", value_parser = bytes)]
     pub(crate) max_mem: Option<u64>,
     /// How the weight blob is read
-    #[arg(long, value_enum, default_value_t = Load::Map)]
+    #[arg(help_heading = "Engine", long, value_enum, default_value_t = Load::Map)]
     pub(crate) load: Load,
 }
 

@@ -38,10 +38,10 @@ struct Cli {
     #[command(subcommand)]
     verb: verbs::Verb,
     /// Report as one JSON document
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = "Report")]
     json: bool,
     /// No remarks and no progress on standard error
-    #[arg(short, long, global = true)]
+    #[arg(short, long, global = true, help_heading = "Report")]
     quiet: bool,
 }
 
@@ -55,4 +55,39 @@ fn main() -> ExitCode {
         },
     });
     exit::code(&result)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    /// Commands of a text's `sh` blocks: lines that start with the program's name, continuations joined.
+    fn commands(text: &str) -> Vec<String> {
+        let joined = text.replace("\\\n", " ");
+        joined.lines().map(str::trim).filter(|l| l.starts_with("streetforward ")).map(str::to_string).collect()
+    }
+
+    #[test]
+    fn the_flags_are_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    /// Every command that the documents show is one that the parser takes.
+    #[test]
+    fn documented_commands_parse() {
+        for (name, text) in [
+            ("README.md", include_str!("../../README.md")),
+            ("tests/data/drive/README.md", include_str!("../../tests/data/drive/README.md")),
+        ] {
+            let list = commands(text);
+            assert!(!list.is_empty(), "{name} shows no command");
+            for line in list {
+                let line = line.split(" #").next().unwrap_or_default();
+                if let Err(e) = Cli::try_parse_from(line.split_whitespace()) {
+                    panic!("{name}: {line}\n{e}");
+                }
+            }
+        }
+    }
 }
