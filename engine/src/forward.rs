@@ -12,7 +12,7 @@ use crate::input::Input;
 use crate::intrinsics::{self, Evidence};
 use crate::model::{DenseHead, Model};
 use crate::output::{Flags, Output};
-use crate::plan::{ClipShape, Plan, trunk_lens};
+use crate::plan::{ClipShape, Dims, Plan, trunk_lens};
 use crate::probe::Probe;
 use crate::tables::{DptTables, Tables, Tokens};
 use crate::unproject::{self, View};
@@ -58,6 +58,23 @@ pub(crate) struct Areas<'a> {
     pub(crate) work: &'a mut [f32],
 }
 
+/// Encodes one frame alone into `out`, `[tokens, dim]` with its register rows unset: the same bits as among
+/// others, because the encoder never looks across frames.
+pub(crate) fn encode_frame(
+    net: Net,
+    plan: &Plan,
+    tables: &Tables,
+    image: &[u8],
+    (work, out): (&mut [f32], &mut [f32]),
+    probe: &mut Probe,
+) -> Result<()> {
+    let one = Dims { frames: 1, ..plan.dims };
+    let [x, tokens, scratch] = carve(work, trunk_lens(net.model, &one, net.ctx.pool.threads()));
+    encoder::run(net, &one, tables, image, encoder::Encode { x, tokens, scratch }, probe)?;
+    out.copy_from_slice(tokens);
+    Ok(())
+}
+
 /// One run.
 pub(crate) struct Forward<'a> {
     pub(crate) net: Net<'a>,
@@ -69,15 +86,28 @@ pub(crate) struct Forward<'a> {
 
 impl Forward<'_> {
     /// The whole network; on success `memory.output` is complete.
-    pub(crate) fn run(&self, areas: Areas, memory: &mut Memory, probe: &mut Probe) -> Result<()> {
+    ///
+    /// `encoded` holds the encoder's tokens of all frames where they are known already.
+    pub(crate) fn run(
+        &self,
+        areas: Areas,
+        encoded: Option<&[f32]>,
+        memory: &mut Memory,
+        probe: &mut Probe,
+    ) -> Result<()> {
         let d = &self.plan.dims;
         let Areas { pairs, motion, work } = areas;
         memory.output.times.copy_from_slice(self.input.times);
         memory.output.flags = Flags { no_motion: motion.is_empty(), intrinsics_assumed: false };
         {
             let [x, tokens, scratch] = carve(work, trunk_lens(self.net.model, d, self.net.ctx.pool.threads()));
-            let to = encoder::Encode { x, tokens, scratch };
-            encoder::run(self.net, d, self.tables, self.input.images, to, probe)?;
+            match encoded {
+                Some(known) => tokens.copy_from_slice(known),
+                None => {
+                    let to = encoder::Encode { x, tokens, scratch };
+                    encoder::run(self.net, d, self.tables, self.input.images, to, probe)?;
+                }
+            }
             let to = aggregator::Aggregate { x: tokens, pairs, scratch };
             aggregator::run(self.net, self.plan, self.tables, self.input.times, to, probe)?;
         }

@@ -37,14 +37,13 @@ pub(crate) struct Probe<'a, 't> {
 }
 
 impl<'a, 't> Probe<'a, 't> {
-    /// Starts the clock.
+    /// Starts the clock; `times` go on from what they hold.
     pub(crate) fn new(
         taps: Option<TapFn<'t>>,
         cancel: &'a AtomicBool,
         deadline: Option<Instant>,
         times: &'a mut [Duration; STAGES.len()],
     ) -> Probe<'a, 't> {
-        *times = Default::default();
         Probe { taps, cancel, deadline, clock: Instant::now(), times }
     }
 

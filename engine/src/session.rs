@@ -3,16 +3,16 @@
 //! Everything is sized and allocated on creation; a run fills the memory again and again. The order of
 //! the network is in `forward.rs`.
 
-use crate::arena::{Arena, carve, carved_len};
+use crate::arena::{Arena, carve, carved_len, filled};
 use crate::block::Net;
-use crate::forward::{Areas, Forward, Memory};
+use crate::forward::{self, Areas, Forward, Memory};
 use crate::input::Input;
 use crate::model::Model;
 use crate::output::Output;
 use crate::plan::{ClipShape, DEFAULT_MAX_BYTES, Plan};
 use crate::probe::{Probe, STAGES, TapFn};
 use crate::tables::Tables;
-use sf_formats::{Error, Result};
+use sf_formats::{Error, Intrinsics, Result};
 use sf_ops::cpu::{Ctx, DefaultFloatMode, Isa, Kernels};
 use sf_ops::par::Pool;
 use std::sync::Arc;
@@ -59,8 +59,48 @@ pub struct Session {
     memory: Memory,
     /// Whether `memory.output` is a whole result.
     complete: bool,
+    window: Option<Window>,
     cancel: Arc<AtomicBool>,
     times: [Duration; STAGES.len()],
+}
+
+/// The last frames of a running camera and their encoder tokens.
+struct Window {
+    /// `[frames, height, width, 3]`.
+    images: Vec<u8>,
+    times: Vec<f64>,
+    /// `[frames, tokens, dim]`.
+    tokens: Vec<f32>,
+    /// Tokens of the frame being encoded.
+    newest: Vec<f32>,
+}
+
+impl Window {
+    /// Room for a full window and the frame that pushes the oldest out.
+    fn new(shape: ClipShape, per_frame: usize) -> Result<Window> {
+        let mut window = Window {
+            images: filled("window", shape.frames * shape.height * shape.width * 3, 0)?,
+            times: filled("window", shape.frames, 0.0)?,
+            tokens: filled("window", shape.frames * per_frame, 0.0)?,
+            newest: filled("window", per_frame, 0.0)?,
+        };
+        window.images.clear();
+        window.times.clear();
+        window.tokens.clear();
+        Ok(window)
+    }
+
+    /// Takes the encoded frame in; the oldest leaves a full window.
+    fn push(&mut self, image: &[u8], time: f64, frames: usize, per_frame: usize) {
+        if self.times.len() == frames {
+            self.images.drain(..image.len());
+            self.times.remove(0);
+            self.tokens.drain(..per_frame);
+        }
+        self.images.extend_from_slice(image);
+        self.times.push(time);
+        self.tokens.extend_from_slice(&self.newest);
+    }
 }
 
 impl Session {
@@ -96,6 +136,7 @@ impl Session {
             arena,
             memory,
             complete: false,
+            window: None,
             cancel,
             times: Default::default(),
         })
@@ -155,14 +196,80 @@ impl Session {
         input.check()?;
         self.model.blob().unchanged()?;
         let _mode = DefaultFloatMode::enter();
+        self.times = Default::default();
+        self.forward(input, None, deadline, taps)?;
+        Ok(&self.memory.output)
+    }
+
+    fn forward(
+        &mut self,
+        input: &Input,
+        encoded: Option<&[f32]>,
+        deadline: Option<Instant>,
+        taps: Option<TapFn>,
+    ) -> Result<()> {
         let [pairs, motion, work] = carve(self.arena.all(), self.plan.areas);
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
         let mut probe = Probe::new(taps, &self.cancel, deadline, &mut self.times);
         self.complete = false;
-        forward.run(Areas { pairs, motion, work }, &mut self.memory, &mut probe)?;
+        forward.run(Areas { pairs, motion, work }, encoded, &mut self.memory, &mut probe)?;
         self.complete = true;
-        Ok(&self.memory.output)
+        Ok(())
+    }
+
+    /// Appends a frame to the session's window and runs the network on the last frames, as many as the
+    /// session is planned for; `None` until there are enough.
+    ///
+    /// Frames are encoded once and their tokens kept, so a step costs one frame of encoder instead of all;
+    /// the result has the same bits as [`Session::run`] on the same frames. The window (frames and their tokens)
+    /// is allocated by the first call, beside the plan's memory. `image` is `[height, width, 3]` at
+    /// the network's size; `time` must be later than the last frame's. A frame that is refused or
+    /// not encoded leaves the window as it was; when a later stage fails, the frame stays in it.
+    pub fn push(&mut self, image: &[u8], time: f64, k: Option<Intrinsics>) -> Result<Option<&Output>> {
+        let shape = self.plan.shape();
+        let one = ClipShape { frames: 1, ..shape };
+        Input { shape: one, images: image, times: &[time], k }.check()?;
+        if let Some(last) = self.window.as_ref().and_then(|w| w.times.last())
+            && time <= *last
+        {
+            return Err(Error::input("frame", format!("time {time} is not after the last frame's {last}")));
+        }
+        self.model.blob().unchanged()?;
+        let _mode = DefaultFloatMode::enter();
+        self.times = Default::default();
+        let per_frame = self.plan.dims.tokens * self.model.config().aa.dim as usize;
+        let mut window = match self.window.take() {
+            Some(window) => window,
+            None => Window::new(shape, per_frame)?,
+        };
+        let pushed = self.encode(image, &mut window);
+        let result = pushed.and_then(|()| {
+            window.push(image, time, shape.frames, per_frame);
+            if window.times.len() < shape.frames {
+                return Ok(false);
+            }
+            let input = Input { shape, images: &window.images, times: &window.times, k };
+            self.forward(&input, Some(&window.tokens), None, None).map(|()| true)
+        });
+        self.window = Some(window);
+        Ok(result?.then_some(&self.memory.output))
+    }
+
+    /// Forgets the frames of [`Session::push`]: the next one starts a new clip.
+    pub fn restart(&mut self) {
+        if let Some(window) = &mut self.window {
+            window.images.clear();
+            window.tokens.clear();
+            window.times.clear();
+        }
+    }
+
+    fn encode(&mut self, image: &[u8], window: &mut Window) -> Result<()> {
+        let [_, _, work] = carve(self.arena.all(), self.plan.areas);
+        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
+        let mut probe = Probe::new(None, &self.cancel, None, &mut self.times);
+        forward::encode_frame(net, &self.plan, &self.tables, image, (work, &mut window.newest), &mut probe)
     }
 
     /// Result of the last run.

@@ -56,6 +56,12 @@ fn a_warm_session_allocates_nothing() {
                 session.run(&clip.input()).unwrap();
             }
             assert_eq!(CALLS.load(SeqCst) - calls, 0, "allocations in warm runs");
+
+            let frame = &clip.images[..28 * 42 * 3];
+            (0..4).for_each(|f| assert_eq!(session.push(frame, f64::from(f), None).unwrap().is_some(), f >= 2));
+            let calls = CALLS.load(SeqCst);
+            (4..7).for_each(|f| assert!(session.push(frame, f64::from(f), None).unwrap().is_some()));
+            assert_eq!(CALLS.load(SeqCst) - calls, 0, "allocations in a warm stream");
         }
     }
 }

@@ -263,6 +263,34 @@ fn a_failed_run_leaves_no_result() {
     session.output();
 }
 
+/// Frames that arrive one by one: every window has the bits of a run from scratch.
+#[test]
+fn a_stream_has_the_bits_of_its_windows() {
+    let config = tiny();
+    let model = model(&config, &tensors(&config, 16), Dtype::F32);
+    let drive = Frames::new(6, 28, 42, 16);
+    let shape = ClipShape { frames: 3, ..drive.shape };
+    let (mut stream, mut scratch) = (session(&model, shape), session(&model, shape));
+    let frame = |f: usize| &drive.images[f * 28 * 42 * 3..][..28 * 42 * 3];
+    for f in 0..6 {
+        let out = stream.push(frame(f), drive.times[f], None).unwrap().cloned();
+        assert_eq!(out.is_some(), f >= 2);
+        if let Some(out) = out {
+            let images = &drive.images[(f - 2) * 28 * 42 * 3..][..3 * 28 * 42 * 3];
+            let input = Input { shape, images, times: &drive.times[f - 2..=f], k: None };
+            assert_eq!(*scratch.run(&input).unwrap(), out, "window that ends with frame {f}");
+        }
+        // Refused frames leave no trace.
+        assert_eq!(stream.push(frame(0), drive.times[f], None).unwrap_err().status(), Status::Input);
+        assert_eq!(stream.push(&frame(0)[1..], 9.0, None).unwrap_err().status(), Status::Input);
+        stream.cancel_flag().store(true, Ordering::Relaxed);
+        assert_eq!(stream.push(frame(0), 9.0, None).unwrap_err().status(), Status::Deadline);
+        stream.cancel_flag().store(false, Ordering::Relaxed);
+    }
+    stream.restart();
+    assert!(stream.push(frame(0), 0.0, None).unwrap().is_none());
+}
+
 #[test]
 fn a_real_drive_is_brought_to_size_and_run() {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("data/drive");
