@@ -6,6 +6,7 @@ use crate::progress::Progress;
 use crate::signals;
 use serde_json::Value;
 use sf_formats::{Error, Result};
+use std::ffi::OsString;
 use std::fmt::Display;
 use std::fs;
 use std::io::{self, Write};
@@ -110,6 +111,16 @@ impl OutputFolder {
             Err(e) if e.kind() == io::ErrorKind::NotFound => false,
             Err(e) => return Err(Error::io(&target, "write", &e)),
         };
+        let (folder, prefix) = if existed {
+            (target.clone(), OsString::from(".streetforward."))
+        } else {
+            let name = target.file_name().ok_or_else(|| Error::usage("the output folder has no name"))?;
+            let mut hidden = OsString::from(".");
+            hidden.push(name);
+            hidden.push(".");
+            (target.with_file_name(""), hidden)
+        };
+        remove_stale(&folder, prefix.as_encoded_bytes());
         if existed && !args.force {
             let mut entries = fs::read_dir(&target).map_err(|e| Error::io(&target, "read", &e))?;
             if entries.next().is_some() {
@@ -120,16 +131,9 @@ impl OutputFolder {
                 return Err(Error::io(&target, "write", &e));
             }
         }
-        let pid = std::process::id();
-        let stage = if existed {
-            target.join(format!(".streetforward.{pid}.tmp"))
-        } else {
-            let name = target.file_name().ok_or_else(|| Error::usage("the output folder has no name"))?;
-            let mut hidden = std::ffi::OsString::from(".");
-            hidden.push(name);
-            hidden.push(format!(".{pid}.tmp"));
-            target.with_file_name(hidden)
-        };
+        let mut name = prefix;
+        name.push(format!("{}.tmp", std::process::id()));
+        let stage = folder.join(name);
         // A killed process may have had the same id.
         let _ = fs::remove_dir_all(&stage);
         signals::guard_stage(&stage);
@@ -178,6 +182,23 @@ impl Drop for OutputFolder {
         if self.live {
             let _ = fs::remove_dir_all(&self.stage);
             signals::release_stage(&self.stage);
+        }
+    }
+}
+
+/// Removes the temporary folders that killed processes left.
+fn remove_stale(folder: &Path, prefix: &[u8]) {
+    if !Path::new("/proc/self").exists() {
+        // Without it nobody tells whether the owner still runs.
+        return;
+    }
+    let here = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    for entry in fs::read_dir(here).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let owner = name.as_encoded_bytes().strip_prefix(prefix).and_then(|n| n.strip_suffix(b".tmp"));
+        let owner = owner.and_then(|n| std::str::from_utf8(n).ok()).and_then(|n| n.parse::<u32>().ok());
+        if owner.is_some_and(|pid| !Path::new(&format!("/proc/{pid}")).exists()) {
+            let _ = fs::remove_dir_all(entry.path());
         }
     }
 }

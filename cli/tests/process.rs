@@ -89,21 +89,25 @@ fn long_synth(out: &std::path::Path) -> Command {
     c
 }
 
+/// A long `synth` that gets a signal once it writes.
+fn signalled(signal: &str, out: &std::path::Path) -> std::process::Output {
+    let child = long_synth(out).spawn().unwrap();
+    for _ in 0..2000 {
+        if !common::files(out.parent().unwrap()).is_empty() {
+            break;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    let kill = Command::new("sh").args(["-c", &format!("kill -{signal} {}", child.id())]).status().unwrap();
+    assert!(kill.success());
+    child.wait_with_output().unwrap()
+}
+
 #[test]
 fn p17_an_interrupt_is_exit_130_and_leaves_nothing() {
     for (signal, code) in [("INT", 130), ("TERM", 143)] {
         let dir = tempfile::tempdir().unwrap();
-        let child = long_synth(&dir.path().join("clip")).spawn().unwrap();
-        // Wait until it writes.
-        for _ in 0..2000 {
-            if !common::files(dir.path()).is_empty() {
-                break;
-            }
-            std::thread::sleep(std::time::Duration::from_millis(5));
-        }
-        let kill = Command::new("sh").args(["-c", &format!("kill -{signal} {}", child.id())]).status().unwrap();
-        assert!(kill.success());
-        let r = ran(child.wait_with_output().unwrap());
+        let r = ran(signalled(signal, &dir.path().join("clip")));
         assert_eq!(r.code, code, "{}", r.stderr);
         assert!(error_line(&r.stderr).contains("interrupted"));
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
@@ -122,4 +126,24 @@ fn c13_a_file_size_limit_is_exit_6_and_leaves_nothing() {
     assert_eq!(r.code, 6, "{}", r.stderr);
     error_line(&r.stderr);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn c14_what_a_killed_command_leaves_is_cleaned_by_the_next() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("clip");
+    let killed = signalled("KILL", &out);
+    assert_eq!(killed.status.code(), None);
+    assert!(!out.exists());
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "the temporary folder is left");
+    ok(&["synth", "--frames", "1", "--size", "28x28", "-o", out.to_str().unwrap()]);
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "the clip alone");
+}
+
+#[test]
+fn b32_a_bus_error_is_exit_9() {
+    let dir = tempfile::tempdir().unwrap();
+    let r = ran(signalled("BUS", &dir.path().join("clip")));
+    assert_eq!(r.code, 9, "{}", r.stderr);
+    assert!(error_line(&r.stderr).contains("cut off while in use"));
 }

@@ -72,6 +72,10 @@ fn everything_is_written_with_the_documented_shapes() {
     assert_eq!((scene.len() + report.dropped(), scene.frames.len()), (3 * 56 * 42, 3));
     let saved: serde_json::Value = serde_json::from_slice(&fs::read(out.join("run.json")).unwrap()).unwrap();
     assert_eq!(saved["output_digest"], json["output_digest"]);
+    for name in ["depth", "conf", "points", "poses", "velocity", "dynamic"] {
+        let [a, b] = [&out, &stages].map(|d| fs::read(d.join(format!("{name}.npy"))).unwrap());
+        assert_eq!(a, b, "{name}");
+    }
     // Stages have a leading frame axis.
     let (shape, _) = npy::read_f32(&stages.join("patches.npy")).unwrap();
     assert_eq!(shape, [3, 12, 16]);
@@ -129,6 +133,9 @@ fn without_a_model_random_weights_run_and_it_says_so() {
     assert!(r.stderr.contains("random weights"), "{}", r.stderr);
     let json: serde_json::Value = serde_json::from_str(&r.stdout).unwrap();
     assert_eq!(json["model"]["random_weights"], true);
+    // It has no confidence head.
+    let line = error_line(&run(&["run", "-i", s(&clip), "-o", s(&out), "--force", "-q", "--emit", "conf"]).stderr[..]);
+    assert!(line.contains("confidence"), "{line}");
 }
 
 #[test]

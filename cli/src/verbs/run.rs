@@ -55,7 +55,7 @@ pub(crate) struct Args {
     /// What to write
     #[arg(long, value_enum, value_delimiter = ',', value_name = "LIST", default_value = "scene,overview")]
     emit: Vec<Emit>,
-    /// Also write every stage of the network as .npy into this folder
+    /// Also write every stage of the network, and all results, as .npy into this folder
     #[arg(long, value_name = "DIR")]
     dump_stages: Option<PathBuf>,
     #[command(flatten)]
@@ -123,6 +123,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     };
     let loaded = reconstruct::load(args.model.as_deref(), &args.engine, args.precision, console)?;
     let config = loaded.model.config();
+    if args.emit.contains(&Emit::Conf) && !config.conf.exists() {
+        return Err(Error::usage("--emit conf: this network has no confidence head"));
+    }
     let size = reconstruct::network_size(config, &clip, args.size);
     let prepared = reconstruct::prepare_clip(config, &clip, k, size)?;
     let mut session = reconstruct::session(&loaded, prepared.shape, &args.engine)?;
@@ -156,6 +159,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     }
     if out.flags.intrinsics_assumed {
         console.warn("the predicted rays fix no focal length: a 64 degree view is assumed; see --intrinsics");
+    }
+    if let Some(folder) = &stages {
+        Array::ALL.into_iter().try_for_each(|a| a.write(out, folder.path()))?;
     }
     let mut scene = out.to_scene(config, &reconstruct::sources(&clip));
     scene.notes = notes(&loaded, &args.clip.input);
@@ -287,18 +293,55 @@ impl Results<'_> {
     }
 }
 
+/// A result as one `.npy` file.
+#[derive(Clone, Copy)]
+enum Array {
+    Depth,
+    Conf,
+    Points,
+    Poses,
+    Velocity,
+    Dynamic,
+}
+
+impl Array {
+    const ALL: [Array; 6] = [Array::Depth, Array::Conf, Array::Points, Array::Poses, Array::Velocity, Array::Dynamic];
+
+    /// Writes it into `folder`; a confidence that the network lacks is left out.
+    fn write(self, out: &Output, folder: &Path) -> Result<()> {
+        let s = out.shape;
+        let save = |name: &str, last: &[usize], values: &[f32]| {
+            let shape = [&[s.frames, s.height, s.width], last].concat();
+            npy::write_f32(&folder.join(name), &shape, values, Overwrite::Yes)
+        };
+        match self {
+            Array::Depth => save("depth.npy", &[], &out.depth),
+            Array::Conf if out.conf.is_empty() => Ok(()),
+            Array::Conf => save("conf.npy", &[], &out.conf),
+            Array::Points => save("points.npy", &[3], out.points.as_flattened()),
+            Array::Poses => {
+                let rows: Vec<f64> = out.poses.iter().flat_map(|p| p.to_rows()).flatten().collect();
+                npy::write_f64(&folder.join("poses.npy"), &[s.frames, 4, 4], &rows, Overwrite::Yes)
+            }
+            Array::Velocity => {
+                let pairs = out.v_fwd.iter().zip(&out.v_bwd);
+                let both: Vec<f32> = pairs.flat_map(|(f, b)| [f[0], f[1], f[2], b[0], b[1], b[2]]).collect();
+                save("velocity.npy", &[6], &both)
+            }
+            Array::Dynamic => save("dynamic.npy", &[], &out.dynamic),
+        }
+    }
+}
+
 fn write_results(args: &Args, folder: &OutputFolder, r: &Results) -> Result<()> {
     let (out, size, n) = (r.out, r.size(), r.pixels());
-    let shape = [out.shape.frames, out.shape.height, out.shape.width];
-    let array = |name: &str, last: &[usize], values: &[f32]| {
-        npy::write_f32(&folder.path().join(name), &[&shape[..], last].concat(), values, Overwrite::Yes)
-    };
+    let array = |a: Array| a.write(out, folder.path());
     let frames = || (0..out.shape.frames).map(|f| (f, f * n..(f + 1) * n));
     for emit in &args.emit {
         match emit {
             Emit::Scene => r.scene.save(folder.path(), Overwrite::Yes)?,
             Emit::Depth => {
-                array("depth.npy", &[], &out.depth)?;
+                array(Array::Depth)?;
                 let (pictures, scale) = (folder.subfolder("depth")?, DepthScale::of(&out.depth));
                 for (f, range) in frames() {
                     let depth = &out.depth[range];
@@ -309,21 +352,15 @@ fn write_results(args: &Args, folder: &OutputFolder, r: &Results) -> Result<()> 
                     image_io::write_png(&pictures.join(format!("{f:06}_colour.png")), &colours, Overwrite::Yes)?;
                 }
             }
-            Emit::Conf if out.conf.is_empty() => {
-                return Err(Error::usage("--emit conf: this network has no confidence head"));
-            }
-            Emit::Conf => array("conf.npy", &[], &out.conf)?,
-            Emit::Points => array("points.npy", &[3], out.points.as_flattened())?,
+            Emit::Conf => array(Array::Conf)?,
+            Emit::Points => array(Array::Points)?,
             Emit::Poses => {
-                let rows: Vec<f64> = out.poses.iter().flat_map(|p| p.to_rows()).flatten().collect();
-                npy::write_f64(&folder.path().join("poses.npy"), &[shape[0], 4, 4], &rows, Overwrite::Yes)?;
+                array(Array::Poses)?;
                 let views = poses_io::views(r.scene);
                 poses_io::export(&views, PoseFormat::Nerfstudio, folder.path(), Overwrite::Yes)?;
             }
             Emit::Velocity => {
-                let both: Vec<f32> =
-                    out.v_fwd.iter().zip(&out.v_bwd).flat_map(|(f, b)| [f[0], f[1], f[2], b[0], b[1], b[2]]).collect();
-                array("velocity.npy", &[6], &both)?;
+                array(Array::Velocity)?;
                 let (pictures, velocity) = (folder.subfolder("velocity")?, r.velocity());
                 let top = picture::top_speed(&velocity, 1.0);
                 for (f, range) in frames() {
@@ -332,7 +369,7 @@ fn write_results(args: &Args, folder: &OutputFolder, r: &Results) -> Result<()> 
                 }
             }
             Emit::Dynamic => {
-                array("dynamic.npy", &[], &out.dynamic)?;
+                array(Array::Dynamic)?;
                 let pictures = folder.subfolder("dynamic")?;
                 for (f, range) in frames() {
                     let gray: Vec<u8> = out.dynamic[range].iter().map(|p| (p * 255.0).round() as u8).collect();
