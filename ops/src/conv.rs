@@ -89,13 +89,14 @@ impl Source for Windows<'_> {
         // Without padding a line of the kernel is one run of neighbours in memory; with it, each pixel may be
         // inside or outside.
         let (steps, run) = if pad == 0 { (1, kernel * x.c) } else { (kernel, x.c) };
+        // Corner of each window in the padded image; divisions are dear, so once per row and not per tap.
+        let corner: [(usize, usize); MAX_MR] =
+            std::array::from_fn(|r| ((first + r) / ow * stride, (first + r) % ow * stride));
         for ky in 0..kernel {
             for kx in 0..steps {
                 let mut from: [&[f32]; MAX_MR] = [&[]; MAX_MR];
                 for (r, from) in from.iter_mut().enumerate().take(rows) {
-                    let (oy, ox) = ((first + r) / ow, (first + r) % ow);
-                    // In the padded image.
-                    let (py, px) = (oy * stride + ky, ox * stride + kx);
+                    let (py, px) = (corner[r].0 + ky, corner[r].1 + kx);
                     if py >= pad && py - pad < x.h && px >= pad && px - pad < x.w {
                         *from = &x.data[((py - pad) * x.w + px - pad) * x.c..];
                     }

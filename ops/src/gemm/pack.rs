@@ -147,8 +147,9 @@ pub(crate) fn pack_rows<S: Simd>(s: S, t: RowPack) {
             if from[r].is_empty() {
                 continue;
             }
+            // Through a register: copied as arrays, these 64 bytes become calls of memcpy.
             if let Some(row) = from[r][k0..].first_chunk::<LANES>() {
-                block[r] = *row;
+                s.load(row).store(&mut block[r]);
             } else {
                 block[r][..len].copy_from_slice(&from[r][k0..k0 + len]);
             }
@@ -163,7 +164,7 @@ pub(crate) fn pack_rows<S: Simd>(s: S, t: RowPack) {
             let at = (k0 + i) * width;
             // Sixteen at once where there is room: what runs over is written again by the next step.
             match out[at..].first_chunk_mut::<LANES>() {
-                Some(to) => *to = *lanes,
+                Some(to) => s.load(lanes).store(to),
                 None => out[at..at + width].copy_from_slice(&lanes[..width]),
             }
         }
