@@ -54,6 +54,7 @@ fn lens(model: &Model, d: &Dims, threads: usize) -> [usize; 5] {
     [values, values, shared, taps(model).len() * values, scratch]
 }
 
+/// Values of working memory of [`run`].
 pub(crate) fn scratch_len(model: &Model, d: &Dims, threads: usize) -> usize {
     carved_len(lens(model, d, threads))
 }
@@ -74,6 +75,7 @@ pub(crate) struct Job<'a> {
     pub(crate) scratch: &'a mut [f32],
 }
 
+/// Both passes (or the one) and the motion head on each; raw maps into `job.raw`.
 pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut Probe) -> Result<()> {
     let (model, w) = (net.model, net.model.weights());
     let config = model.config();
@@ -128,6 +130,7 @@ fn gather(config: &ModelConfig, d: &Dims, (last, times): (Features, &[f64]), out
     }
 }
 
+/// One pass over time.
 struct Pass<'a> {
     net: Net<'a>,
     d: &'a Dims,
@@ -141,6 +144,7 @@ struct Pass<'a> {
 }
 
 impl Pass<'_> {
+    /// All causal layers in place on `x`; layer 0 from `shared` q|k|v where both passes have it.
     fn layers(
         &self,
         shared: Option<&[f32]>,
@@ -174,6 +178,7 @@ impl Pass<'_> {
         Ok(())
     }
 
+    /// The motion head on this pass's tokens or taps.
     fn motion(&self, x: &[f32], tapped: &[f32], scratch: &mut [f32], raw: &mut [f32], probe: &mut Probe) -> Result<()> {
         let (d, dim) = (self.d, self.blocks[0].dim);
         let head = self.net.model.weights().motion.as_ref().expect("a causal module has a motion head");

@@ -34,6 +34,7 @@ fn lens(camera: &model::Camera, d: &Dims, threads: usize) -> [usize; 4] {
     [decoded, hidden, hidden, decoder::scratch_len(&camera.decoder, d, d.tokens, threads)]
 }
 
+/// Values of working memory of [`run`].
 pub(crate) fn scratch_len(camera: &model::Camera, d: &Dims, threads: usize) -> usize {
     carved_len(lens(camera, d, threads))
 }

@@ -19,6 +19,7 @@ fn lens(decoder: &Decoder, d: &Dims, tokens: usize, threads: usize) -> [usize; 2
     [d.frames * tokens * decoder.projects.weight.n, blocks.unwrap_or(0)]
 }
 
+/// Values of working memory of [`run`].
 pub(crate) fn scratch_len(decoder: &Decoder, d: &Dims, tokens: usize, threads: usize) -> usize {
     carved_len(lens(decoder, d, tokens, threads))
 }

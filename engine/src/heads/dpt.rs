@@ -61,6 +61,7 @@ impl Dpt {
     }
 }
 
+/// Values of working memory of [`frame`].
 pub(crate) fn scratch_len(head: &Dpt, d: &Dims) -> usize {
     carved_len(lens(head, d))
 }
@@ -74,12 +75,13 @@ pub(crate) struct Pyramid<'a> {
     pub(crate) out: &'a mut [f32],
 }
 
+/// Convolutions of one head.
 struct Layers<'a> {
     net: Net<'a>,
     head: &'a Dpt,
 }
 
-/// A map of a level: its size, `features` channels unless said otherwise.
+/// One convolution: "same" padding, optional rectifier before and after.
 #[derive(Clone, Copy)]
 struct Layer<'a> {
     weights: &'a Linear,
@@ -90,12 +92,14 @@ struct Layer<'a> {
 }
 
 impl<'a> Layer<'a> {
+    /// Stride 1, nothing before or after.
     fn same(weights: &'a Linear, kernel: usize) -> Layer<'a> {
         Layer { weights, kernel, stride: 1, act: Act::None, relu_input: Act::None }
     }
 }
 
 impl Layers<'_> {
+    /// out = act(conv(x)) + residual.
     fn conv(&self, layer: Layer, x: Hwc, residual: Option<Hwc>, out: HwcMut) {
         let model = self.net.model;
         let conv = Conv {
@@ -110,6 +114,7 @@ impl Layers<'_> {
         conv::conv2d(self.net.ctx, x, &conv, residual, out);
     }
 
+    /// Transposed convolution with stride = kernel.
     fn up(&self, weights: &Linear, kernel: usize, x: Hwc, out: HwcMut) {
         let model = self.net.model;
         let bias = weights.bias.map(|b| model.values(b));

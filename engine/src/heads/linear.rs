@@ -21,6 +21,7 @@ fn lens(head: &LinearHead, d: &Dims, tokens: usize, threads: usize) -> [usize; 2
     [decoded, work]
 }
 
+/// Values of working memory of [`prepare`] and [`frame`].
 pub(crate) fn scratch_len(head: &LinearHead, d: &Dims, tokens: usize, threads: usize) -> usize {
     carved_len(lens(head, d, tokens, threads))
 }
@@ -33,6 +34,7 @@ fn per_frame(dense: &Dense, x: &Features) -> usize {
     }
 }
 
+/// Decodes the tokens of all frames; they stay at the start of `scratch`.
 pub(crate) fn prepare(
     dense: &Dense,
     head: &LinearHead,
@@ -45,6 +47,7 @@ pub(crate) fn prepare(
     decoder::run(dense.net, &head.decoder, (dense.dims, dense.tables), job, (work, decoded), probe)
 }
 
+/// Patch pixels of one frame, shuffled into its raw map `[height, width, out]`.
 pub(crate) fn frame(
     dense: &Dense,
     head: &LinearHead,
