@@ -1,8 +1,8 @@
 //! `demo`: a synthetic street through the network, with everything worth looking at.
 //!
-//! The clip is drawn by the command itself from a held-out seed (20 frames of 252x168 at 10 Hz, exact ground
-//! truth), so the demonstration works from any folder and needs no file. Frames 0, 5, 10 and 15 go through the
-//! network; the other 16 judge what comes out.
+//! The clip is the shipped one, `models/demo-clip` (20 frames of 252x168 at 10 Hz from a held-out seed). The
+//! command draws it, with the exact ground truth, so the demonstration works from any folder and needs no file.
+//! Frames 0, 5, 10 and 15 go through the network; the other 16 judge what comes out.
 //!
 //! ```text
 //! DIR/overview.png        per context frame: picture, depth and true depth, motion and true motion, dynamic
