@@ -171,6 +171,9 @@ struct Source {
 }
 
 impl Scene {
+    /// Times closer than this, in seconds, are the same time.
+    pub const SAME_TIME: f64 = 1e-6;
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.gaussians.len()
@@ -192,13 +195,12 @@ impl Scene {
     /// microsecond) the own-frame rule decides. Beyond the ends only the last (first) `window` frames
     /// take part.
     fn sources(&self, time: f64, rules: &Compose) -> Vec<Source> {
-        const SAME: f64 = 1e-6;
         let n = self.frames.len();
         let last = n.saturating_sub(1);
         let w = rules.window.max(1) as usize;
-        let own = self.frames.iter().position(|f| (f.time - time).abs() <= SAME);
+        let own = self.frames.iter().position(|f| (f.time - time).abs() <= Self::SAME_TIME);
         // Frames strictly before the time.
-        let before = self.frames.iter().take_while(|f| f.time < time - SAME).count();
+        let before = self.frames.iter().take_while(|f| f.time < time - Self::SAME_TIME).count();
         let (lo, hi) = match own {
             Some(f) if rules.own == SelfRule::Own || n == 1 => (f, f + 1),
             Some(f) => (f.saturating_sub(w), (f + w + 1).min(n)),

@@ -110,7 +110,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     }
     let views = chosen_views(args, &scene)?;
     let (first, last) = scene.time_range();
-    let beyond = views.iter().filter(|v| v.time < first || v.time > last).count();
+    let beyond = views.iter().filter(|v| v.time < first - Scene::SAME_TIME || v.time > last + Scene::SAME_TIME).count();
     if beyond > 0 {
         console
             .note(format!("{beyond} of {} views lie beyond the clip's {first} to {last} s: extrapolated", views.len()));
