@@ -5,6 +5,7 @@
 //! [`Kernels::capped`] and can only lower what was detected. A cap that this CPU does not have is an
 //! error, never a silent fallback.
 
+use crate::gemm::s8::table::{GEMM_S8, GemmS8Kernel};
 use crate::gemm::table::{GEMM_F, GemmKernel, WeightType};
 use crate::simd::table::{VECTOR, VectorKernels};
 use std::sync::OnceLock;
@@ -160,6 +161,8 @@ pub struct Kernels {
     pub gemm_f32: &'static GemmKernel,
     /// Matrix product with f16 weights.
     pub gemm_f16: &'static GemmKernel,
+    /// Matrix product with int8 activations and weights.
+    pub gemm_s8: &'static GemmS8Kernel,
     /// Element-wise and row-wise operations.
     pub vector: &'static VectorKernels,
 }
@@ -173,6 +176,7 @@ impl Kernels {
             features,
             gemm_f32: gemm(WeightType::F32).expect("a scalar row ends the table"),
             gemm_f16: gemm(WeightType::F16).expect("a scalar row ends the table"),
+            gemm_s8: GEMM_S8.iter().find(|k| features.has(k.needs)).expect("a scalar row ends the table"),
             vector: VECTOR.iter().find(|k| features.has(k.needs)).expect("a scalar row ends the table"),
         }
     }
@@ -361,6 +365,7 @@ mod tests {
             assert!(Features::detected().has(k.features));
             assert!(k.isa.features().has(k.features));
             assert!(k.features.has(k.gemm_f32.needs) && k.features.has(k.vector.needs));
+            assert!(k.features.has(k.gemm_f16.needs) && k.features.has(k.gemm_s8.needs));
         }
         let foreign = if cfg!(target_arch = "x86_64") { Isa::Neon } else { Isa::Avx2 };
         let e = Kernels::capped(foreign).unwrap_err();

@@ -7,6 +7,8 @@
 //! | `cpu.rs` | [`Features`](cpu::Features), [`Isa`](cpu::Isa), [`Kernels`], [`Ctx`]: what this CPU can do and which rows follow |
 //! | `simd/` | 16-lane vectors, one file per instruction set, and the table of vector kernels |
 //! | `gemm/` | matrix product with f32 or f16 weights in K1N16 panels; its table and packers |
+//! | `gemm/s8/` | matrix product with int8 activations and weights, exact sums |
+//! | `quantize.rs` `hadamard.rs` | rows to int8 per token, after layer norm and random-sign Hadamard rotation |
 //! | `attention.rs` | frame-masked attention with streaming softmax |
 //! | `conv.rs` | convolution and transposed convolution through the panels |
 //! | `layernorm.rs` `rope.rs` | norms and rotary embedding |
@@ -26,10 +28,12 @@ pub mod conv;
 pub mod cpu;
 pub mod elementwise;
 pub mod gemm;
+pub mod hadamard;
 pub mod layernorm;
 pub mod mat;
 pub mod par;
 pub mod peak;
+pub mod quantize;
 pub mod reference;
 pub mod resize;
 pub mod rope;

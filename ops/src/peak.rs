@@ -1,8 +1,9 @@
-//! The arithmetic peak of one core: a loop of independent fused multiply-adds that touches no memory.
+//! The arithmetic peak of one core: a loop of independent fused multiply-adds (or byte dot products) in registers.
 //!
 //! `doctor` and `bench` state kernel speeds as a share of it.
 
 use crate::cpu::Kernels;
+use crate::gemm::s8::tile::PEAK_STEPS;
 use crate::simd::{Simd, Vector, fold_add};
 use std::time::{Duration, Instant};
 
@@ -58,6 +59,22 @@ pub fn flops_per_second(kernels: &Kernels, time: Duration) -> f64 {
     best
 }
 
+/// Most int8 operations per second (two per multiply-add) that one thread reached in `time`, with the dot product of these
+/// kernels.
+pub fn s8_ops_per_second(kernels: &Kernels, time: Duration) -> f64 {
+    let start = Instant::now();
+    let mut best = 0.0f64;
+    let mut seed = 1;
+    while best == 0.0 || start.elapsed() < time {
+        let t = Instant::now();
+        seed = kernels.peak_s8(seed);
+        // Four products for each output of the tile.
+        let ops = 2.0 * 4.0 * (kernels.gemm_s8.mr * kernels.gemm_s8.nr * PEAK_STEPS) as f64;
+        best = best.max(ops / t.elapsed().as_secs_f64().max(1e-9));
+    }
+    best
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -67,6 +84,9 @@ mod tests {
         for k in Kernels::available() {
             let peak = flops_per_second(k, Duration::from_millis(1));
             println!("{}: {:.1} GFLOP/s", k.vector.name, peak * 1e-9);
+            assert!(peak > 1e6 && peak < 1e13, "{peak} operations per second");
+            let peak = s8_ops_per_second(k, Duration::from_millis(1));
+            println!("{}: {:.1} GOP/s", k.gemm_s8.name, peak * 1e-9);
             assert!(peak > 1e6 && peak < 1e13, "{peak} operations per second");
         }
     }

@@ -31,6 +31,53 @@ pub fn linear(x: Mat, w: &[f32], bias: Option<&[f32]>) -> Vec<f32> {
     out
 }
 
+/// a W^T in integers: `a` `[rows, k]`, `w` `[n, k]` -> `[rows, n]`.
+pub fn gemm_s8(a: &[i8], w: &[i8], k: usize) -> Vec<i32> {
+    let mut out = Vec::new();
+    for row in a.chunks_exact(k) {
+        for wj in w.chunks_exact(k) {
+            out.push(row.iter().zip(wj).map(|(&x, &y)| i32::from(x) * i32::from(y)).sum());
+        }
+    }
+    out
+}
+
+/// The epilogue of an int8 product with `f32` steps, each rounded once: act(fma(sum, row scale * output scale, bias)) * gamma,
+/// added to `before` with `residual`. Up to the activation it is bit-equal to the fast one.
+pub fn dequantize(sum: i32, scales: (f32, f32), bias: f32) -> f32 {
+    (sum as f32).mul_add(scales.0 * scales.1, bias)
+}
+
+/// A row to int8: m = max |x|, (round(x * (127 / m)) clamped to [-127, 127], m / 127); zeros and 0 where 127 / m is not finite, zeros and
+/// NaN where a value is not. Bit-equal to the fast one.
+pub fn quantize(x: &[f32]) -> (Vec<i8>, f32) {
+    if x.iter().any(|v| !v.is_finite()) {
+        return (vec![0; x.len()], f32::NAN);
+    }
+    let max = x.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    let inverse = 127.0 / max;
+    if !inverse.is_finite() {
+        return (vec![0; x.len()], 0.0);
+    }
+    (x.iter().map(|v| (v * inverse).clamp(-127.0, 127.0).round_ties_even() as i8).collect(), max / 127.0)
+}
+
+/// y_i = 1/sqrt(b) sum over j of (-1)^popcount(i & j) d_j x_j in each block of b values; d_j = -1 where bit j % 16 of
+/// `signs[j / 16]` is set.
+pub fn hadamard(x: &[f32], signs: &[u16], block: usize) -> Vec<f32> {
+    let c = 1.0 / (block as f64).sqrt();
+    (0..x.len())
+        .map(|i| {
+            let first = i / block * block;
+            let term = |j: usize| {
+                let negative = (i & (j - first) & (block - 1)).count_ones() + u32::from(signs[j / 16] >> (j % 16) & 1);
+                if negative.is_multiple_of(2) { f64::from(x[j]) } else { -f64::from(x[j]) }
+            };
+            ((first..first + block).map(term).sum::<f64>() * c) as f32
+        })
+        .collect()
+}
+
 /// (x - mean) / sqrt(var + eps) * gain + offset per row, var with divisor `cols`; `[rows, cols]`.
 pub fn layernorm(x: Mat, gain: &[f32], offset: &[f32], eps: f32) -> Vec<f32> {
     let mut out = Vec::with_capacity(x.rows * x.cols);

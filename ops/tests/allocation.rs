@@ -2,7 +2,11 @@
 
 use sf_ops::attention::{FrameMask, attention, scratch_len};
 use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
-use sf_ops::gemm::{Act, Epilogue, Panels, gemm, pack_f32, panel_len};
+use sf_ops::gemm::{
+    Act, Epilogue, Panels, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, pack_f32, panel_len, panel_len_s8,
+};
+use sf_ops::hadamard::Rotation;
+use sf_ops::quantize::{Before, Norm, quantize};
 use sf_ops::resize::{Corners, bilinear};
 use sf_ops::rope::{AngleRound, RopeTable, qk_norm_rope};
 use sf_ops::{Ctx, Hwc, HwcMut, Kernels, Mat, MatMut, elementwise, layernorm, par::Pool};
@@ -57,6 +61,9 @@ fn the_second_run_allocates_nothing() {
         act: Act::Relu,
     };
     let up = ConvTranspose { weight: Panels::f32(&panels[..panel_len(c, c)], c, c), bias: None, kernel: 2 };
+    let (mut bytes, mut scales) = (vec![0i8; rows * c], vec![0.0; rows]);
+    let (bytes_w, sums) = (vec![3i8; panel_len_s8(c, c)], vec![3 * c as i32; c]);
+    let signs = vec![0x5a5a; c / 16];
     let mut round = || {
         let a = Mat::new(&x[..rows * c], rows, c);
         let ep = Epilogue { act: Act::Gelu, residual: true, ..Epilogue::default() };
@@ -66,6 +73,12 @@ fn the_second_run_allocates_nothing() {
         attention(ctx, Mat::new(&qkv, rows, 3 * c), heads, mask, &mut scratch, MatMut::new(&mut y, rows, c));
         elementwise::gelu_in_place(ctx, &mut y);
         let image = Hwc::new(&x[..rows * c], 10, 14, c);
+        let norm = Norm { affine: None, eps: 1e-6 };
+        let before = Before { norm: Some(norm), rotation: Some(Rotation::new(c, &signs)) };
+        quantize(ctx, a, before, RowsS8Mut { m: rows, k: c, data: &mut bytes, scales: &mut scales });
+        let quantized = RowsS8 { m: rows, k: c, data: &bytes, scales: &scales };
+        let w = PanelsS8 { n: c, k: c, data: &bytes_w, scales: &x[..c], col_sums: &sums };
+        gemm_s8(ctx, quantized, w, ep, MatMut::new(&mut y, rows, c));
         conv2d(ctx, image, &conv, None, HwcMut::new(&mut y, 10, 14, c));
         conv_transpose(ctx, image, &up, HwcMut::new(&mut big[..rows * c], 20, 28, c / 4));
         bilinear(ctx, image, Corners::Aligned, HwcMut::new(&mut big, 20, 28, c));

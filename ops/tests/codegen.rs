@@ -1,4 +1,4 @@
-//! Every x86-64 tile must be one tight loop: its multiply-adds, no call and, in release builds, no vector spilled
+//! Every x86-64 tile must be one tight loop: its multiply-adds (or byte dot products), no call and, in release builds, no vector spilled
 //! to the stack. A trait method that was not inlined gives right results tens of times slower, and nothing else tells.
 //!
 //! Disassembles this test's own binary (sf-ops is optimised in every profile) with `objdump`.
@@ -6,9 +6,21 @@
 #![cfg(all(target_arch = "x86_64", target_os = "linux"))]
 
 use sf_ops::Ctx;
-use sf_ops::gemm::{Epilogue, GEMM_F, Panels, WeightType, gemm, panel_len};
+use sf_ops::gemm::{Epilogue, GEMM_F, GEMM_S8, Panels, PanelsS8, RowsS8, WeightType, gemm, gemm_s8_sums, panel_len};
 use sf_ops::{Kernels, Mat, MatMut, par::Pool};
 use std::process::Command;
+
+/// The one instruction of each kernel family that does the work.
+const WORK: [&str; 3] = ["vfmadd", "vpdpbusd", "vpmaddubsw"];
+
+/// What the tables of both families say of a kernel.
+struct Tile {
+    name: &'static str,
+    entry: &'static str,
+    rows: &'static [usize],
+    mr: usize,
+    nr: usize,
+}
 
 /// One loop: instructions from a backward jump's target to the jump.
 struct Loop {
@@ -40,7 +52,7 @@ fn loops(lines: &[&str]) -> Vec<Loop> {
         let Some(start) = lines[..i].iter().position(|l| address(l) == Some(target)) else { continue };
         let body = &lines[start..=i];
         found.push(Loop {
-            multiply_adds: body.iter().filter(|l| l.contains("vfmadd")).count(),
+            multiply_adds: body.iter().filter(|l| WORK.iter().any(|w| l.contains(w))).count(),
             clean: !body.iter().any(|l| l.contains("call") || spills(l)),
         });
     }
@@ -56,6 +68,9 @@ fn tiles_are_tight_loops() {
     for kernels in Kernels::available() {
         let out = MatMut::new(&mut y, 1, 1);
         gemm(Ctx { pool: &pool, kernels }, Mat::new(&[1.0], 1, 1), Panels::f32(&w, 1, 1), Epilogue::default(), out);
+        let rows = RowsS8 { m: 1, k: 1, data: &[1; 4], scales: &[1.0] };
+        let w = PanelsS8 { n: 1, k: 1, data: &[1; 64], scales: &[1.0], col_sums: &[1] };
+        gemm_s8_sums(Ctx { pool: &pool, kernels }, rows, w, &mut [0]);
     }
     let exe = std::env::current_exe().unwrap();
     let Ok(dump) = Command::new("objdump").args(["-d", "--no-show-raw-insn"]).arg(exe).output() else {
@@ -64,17 +79,23 @@ fn tiles_are_tight_loops() {
     };
     let text = String::from_utf8(dump.stdout).unwrap();
     let lines: Vec<&str> = text.lines().collect();
-    for row in GEMM_F.iter().filter(|r| !r.name.ends_with("_scalar")) {
+    let float = GEMM_F.iter().map(|r| {
+        let entry = if r.weights == WeightType::F32 { "gemm_f32" } else { "gemm_f16" };
+        Tile { name: r.name, entry, rows: r.rows, mr: r.mr, nr: r.nr }
+    });
+    let int8 = GEMM_S8.iter().map(|r| Tile { name: r.name, entry: "gemm_s8", rows: r.rows, mr: r.mr, nr: r.nr });
+    for row in float.chain(int8).filter(|r| !r.name.ends_with("_scalar")) {
         let isa = row.name.rsplit('_').next().unwrap();
-        let entry = if row.weights == WeightType::F32 { "gemm_f32" } else { "gemm_f16" };
+        // The mangled name holds module and function with their lengths: `6avx512`, not `10avx512vnni`.
+        let module = format!("{}{isa}", isa.len());
         let start = lines
             .iter()
-            .position(|l| l.ends_with(">:") && l.contains(isa) && l.contains(entry))
+            .position(|l| l.ends_with(">:") && l.contains(&module) && l.contains(row.entry))
             .unwrap_or_else(|| panic!("{} is not in the binary", row.name));
         let end = lines[start..].iter().position(|l| l.is_empty()).map_or(lines.len(), |n| start + n);
         let loops = loops(&lines[start..end]);
-        // AVX2 vectors of 16 lanes are two registers.
-        let registers = row.nr / if isa == "avx2" { 8 } else { 16 };
+        // AVX2 and AVX-VNNI vectors of 16 lanes are two registers.
+        let registers = row.nr / if isa.starts_with("avx512") { 16 } else { 8 };
         for rows in row.rows {
             // The compiler may unroll small tiles.
             let wanted = rows * registers;

@@ -1,6 +1,7 @@
-//! out = epilogue(A W^T): f32 activations, f32 or f16 weights in K1N16 panels.
+//! out = epilogue(A W^T): f32 activations, f32 or f16 weights in K1N16 panels. The int8 family is in `s8/`.
 
 pub mod pack;
+pub mod s8;
 pub mod table;
 pub(crate) mod tile;
 
@@ -11,6 +12,9 @@ use pack::{Change, MAX_MR, RowPack, strided};
 use tile::{Finish, Tile};
 
 pub use pack::{NR, PanelData, Panels, pack_f16, pack_f32, panel_len, unpack};
+pub use s8::pack::{PanelsS8, RowsS8, RowsS8Mut, col_sums, pack_s8, padded_k, panel_len_s8, unpack_s8};
+pub use s8::table::{GEMM_S8, GemmS8Kernel};
+pub use s8::{gemm_s8, gemm_s8_sums, working_memory_s8};
 pub use table::{GEMM_F, GemmKernel, WeightType};
 
 /// Activation of an epilogue.

@@ -51,6 +51,15 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
+    fn load_i32(self, x: &[i32; LANES]) -> V {
+        // SAFETY: the token proves avx2; 16 values are readable.
+        unsafe {
+            let p = x.as_ptr().cast::<__m256i>();
+            V(_mm256_cvtepi32_ps(_mm256_loadu_si256(p)), _mm256_cvtepi32_ps(_mm256_loadu_si256(p.add(1))))
+        }
+    }
+
+    #[inline(always)]
     fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
         // SAFETY: the token proves avx2; every load and store is half a row of the array.
         unsafe {
@@ -185,6 +194,46 @@ impl Vector for V {
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_slli_epi32::<23>(_mm256_castps_si256(x)), bias))
             };
             V(scale(self.0), scale(self.1))
+        }
+    }
+
+    #[inline(always)]
+    fn negate(self, lanes: u16) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let bits = _mm256_set1_epi32(i32::from(lanes));
+            let half = |x: __m256, bit: __m256i| {
+                let chosen = _mm256_cmpeq_epi32(_mm256_and_si256(bits, bit), bit);
+                _mm256_xor_ps(x, _mm256_and_ps(_mm256_castsi256_ps(chosen), _mm256_set1_ps(-0.0)))
+            };
+            let low = _mm256_setr_epi32(1, 1 << 1, 1 << 2, 1 << 3, 1 << 4, 1 << 5, 1 << 6, 1 << 7);
+            V(half(self.0, low), half(self.1, _mm256_slli_epi32::<8>(low)))
+        }
+    }
+
+    #[inline(always)]
+    fn swap<const H: usize>(self) -> V {
+        let V(a, b) = self;
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            match H {
+                1 => V(_mm256_permute_ps::<0xb1>(a), _mm256_permute_ps::<0xb1>(b)),
+                2 => V(_mm256_permute_ps::<0x4e>(a), _mm256_permute_ps::<0x4e>(b)),
+                4 => V(_mm256_permute2f128_ps::<0x01>(a, a), _mm256_permute2f128_ps::<0x01>(b, b)),
+                _ => V(b, a),
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn store_s8(self, x: &mut [i8; LANES]) {
+        // SAFETY: the vector proves avx2; 16 bytes are writable.
+        unsafe {
+            // Packing works inside halves: 0-3 8-11 | 4-7 12-15, put in order by the permutation of quads.
+            let words = _mm256_packs_epi32(_mm256_cvtps_epi32(self.0), _mm256_cvtps_epi32(self.1));
+            let words = _mm256_permute4x64_epi64::<0xd8>(words);
+            let bytes = _mm_packs_epi16(_mm256_castsi256_si128(words), _mm256_extracti128_si256::<1>(words));
+            _mm_storeu_si128(x.as_mut_ptr().cast(), bytes);
         }
     }
 }

@@ -49,6 +49,12 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
+    fn load_i32(self, x: &[i32; LANES]) -> V {
+        // SAFETY: the token proves avx512f; 16 values are readable.
+        unsafe { V(_mm512_cvtepi32_ps(_mm512_loadu_si512(x.as_ptr().cast()))) }
+    }
+
+    #[inline(always)]
     fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
         // SAFETY: the token proves avx512f; every load and store is one row of the array.
         unsafe {
@@ -156,6 +162,32 @@ impl Vector for V {
             let shifted = _mm512_slli_epi32::<23>(_mm512_castps_si512(self.0));
             V(_mm512_castsi512_ps(_mm512_add_epi32(shifted, _mm512_set1_epi32(bias << 23))))
         }
+    }
+
+    #[inline(always)]
+    fn negate(self, lanes: u16) -> V {
+        // SAFETY: the vector proves avx512dq.
+        unsafe { V(_mm512_mask_xor_ps(self.0, lanes, self.0, _mm512_set1_ps(-0.0))) }
+    }
+
+    #[inline(always)]
+    fn swap<const H: usize>(self) -> V {
+        let x = self.0;
+        // SAFETY: the vector proves avx512f.
+        unsafe {
+            V(match H {
+                1 => _mm512_permute_ps::<0xb1>(x),
+                2 => _mm512_permute_ps::<0x4e>(x),
+                4 => _mm512_shuffle_f32x4::<0xb1>(x, x),
+                _ => _mm512_shuffle_f32x4::<0x4e>(x, x),
+            })
+        }
+    }
+
+    #[inline(always)]
+    fn store_s8(self, x: &mut [i8; LANES]) {
+        // SAFETY: the vector proves avx512f; 16 bytes are writable.
+        unsafe { _mm_storeu_si128(x.as_mut_ptr().cast(), _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(self.0))) }
     }
 }
 

@@ -33,6 +33,8 @@ pub(crate) trait Simd: Copy {
     fn load(self, x: &[f32; LANES]) -> Self::V;
     /// Lane i from the half-precision bits `x[i]`; exact.
     fn load_f16(self, x: &[u16; LANES]) -> Self::V;
+    /// Lane i from the integer `x[i]`, rounded to nearest, ties to even.
+    fn load_i32(self, x: &[i32; LANES]) -> Self::V;
     /// Swaps rows and columns.
     #[inline(always)]
     fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
@@ -62,6 +64,12 @@ pub(crate) trait Vector:
     fn abs(self) -> Self;
     /// (bits(self) << 23) + (`bias` << 23) as float: 2^(n + bias - 127) when the low bits of self hold n.
     fn pow2_of_low_bits(self, bias: i32) -> Self;
+    /// Flips the sign of lane i where bit i of `lanes` is set; also of zeros.
+    fn negate(self, lanes: u16) -> Self;
+    /// Lane i takes lane i ^ H, for H = 1, 2, 4, 8.
+    fn swap<const H: usize>(self) -> Self;
+    /// Lanes in [-127, 127] to bytes, rounded to nearest, ties to even.
+    fn store_s8(self, x: &mut [i8; LANES]);
 }
 
 /// Sum of the lanes in the one fixed order: l + (l+8), then +4, +2, +1.

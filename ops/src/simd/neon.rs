@@ -56,6 +56,20 @@ impl Simd for Neon {
             V([widen(vld1_u16(p)), widen(vld1_u16(p.add(4))), widen(vld1_u16(p.add(8))), widen(vld1_u16(p.add(12)))])
         }
     }
+
+    #[inline(always)]
+    fn load_i32(self, x: &[i32; LANES]) -> V {
+        let p = x.as_ptr();
+        // SAFETY: the token proves neon; 16 values are readable.
+        unsafe {
+            V([
+                vcvtq_f32_s32(vld1q_s32(p)),
+                vcvtq_f32_s32(vld1q_s32(p.add(4))),
+                vcvtq_f32_s32(vld1q_s32(p.add(8))),
+                vcvtq_f32_s32(vld1q_s32(p.add(12))),
+            ])
+        }
+    }
 }
 
 /// Four half-precision values to f32; exact.
@@ -189,7 +203,58 @@ impl Vector for V {
             V(y)
         }
     }
+
+    #[inline(always)]
+    fn negate(self, lanes: u16) -> V {
+        let mut y = self.0;
+        // SAFETY: the vector proves neon; the table holds 16 values.
+        unsafe {
+            let bits = vdupq_n_u32(u32::from(lanes));
+            for (i, r) in y.iter_mut().enumerate() {
+                let chosen = vtstq_u32(bits, vld1q_u32(BIT.as_ptr().add(4 * i)));
+                let sign = vandq_u32(chosen, vdupq_n_u32(1 << 31));
+                *r = vreinterpretq_f32_u32(veorq_u32(vreinterpretq_u32_f32(*r), sign));
+            }
+        }
+        V(y)
+    }
+
+    #[inline(always)]
+    fn swap<const H: usize>(self) -> V {
+        let [a, b, c, d] = self.0;
+        // SAFETY: the vector proves neon.
+        unsafe {
+            match H {
+                1 => V([vrev64q_f32(a), vrev64q_f32(b), vrev64q_f32(c), vrev64q_f32(d)]),
+                2 => V([vextq_f32::<2>(a, a), vextq_f32::<2>(b, b), vextq_f32::<2>(c, c), vextq_f32::<2>(d, d)]),
+                4 => V([b, a, d, c]),
+                _ => V([c, d, a, b]),
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn store_s8(self, x: &mut [i8; LANES]) {
+        let [a, b, c, d] = self.0;
+        // SAFETY: the vector proves neon; 16 bytes are writable.
+        unsafe {
+            let low = vcombine_s16(vmovn_s32(vcvtnq_s32_f32(a)), vmovn_s32(vcvtnq_s32_f32(b)));
+            let high = vcombine_s16(vmovn_s32(vcvtnq_s32_f32(c)), vmovn_s32(vcvtnq_s32_f32(d)));
+            vst1q_s8(x.as_mut_ptr(), vcombine_s8(vmovn_s16(low), vmovn_s16(high)));
+        }
+    }
 }
+
+/// Bit i of a lane mask.
+static BIT: [u32; LANES] = {
+    let mut bit = [0; LANES];
+    let mut i = 0;
+    while i < LANES {
+        bit[i] = 1 << i;
+        i += 1;
+    }
+    bit
+};
 
 super::table::vector_kernels!("vector_neon", crate::cpu::Features::NEON, Neon, "neon");
 crate::gemm::tile::gemm_entries!(Neon, rows [1, 2, 3, 4, 5, 6], panels [1], "neon");

@@ -37,6 +37,11 @@ impl Simd for Scalar {
     fn load_f16(self, x: &[u16; LANES]) -> Lanes {
         Lanes(x.map(|bits| half::f16::from_bits(bits).to_f32_const()))
     }
+
+    #[inline(always)]
+    fn load_i32(self, x: &[i32; LANES]) -> Lanes {
+        Lanes(x.map(|v| v as f32))
+    }
 }
 
 impl Lanes {
@@ -108,6 +113,27 @@ impl Vector for Lanes {
     fn pow2_of_low_bits(self, bias: i32) -> Lanes {
         Lanes(self.0.map(|x| f32::from_bits((x.to_bits() << 23).wrapping_add((bias as u32) << 23))))
     }
+
+    #[inline(always)]
+    fn negate(self, lanes: u16) -> Lanes {
+        Lanes(std::array::from_fn(|i| f32::from_bits(self.0[i].to_bits() ^ (u32::from(lanes >> i & 1) << 31))))
+    }
+
+    #[inline(always)]
+    fn swap<const H: usize>(self) -> Lanes {
+        Lanes(std::array::from_fn(|i| self.0[i ^ H]))
+    }
+
+    #[inline(always)]
+    fn store_s8(self, x: &mut [i8; LANES]) {
+        *x = self.0.map(round_s8);
+    }
+}
+
+/// A value in [-127, 127] to the nearest integer, ties to even: adding 1.5 * 2^23 leaves it in the low bits.
+#[inline(always)]
+fn round_s8(x: f32) -> i8 {
+    (x + 12_582_912.0).to_bits() as u8 as i8
 }
 
 /// Token of a vector with one lane, for the scalar functions: the same bodies, so the same bits.
@@ -142,6 +168,11 @@ impl Simd for Single {
     #[inline(always)]
     fn load_f16(self, x: &[u16; LANES]) -> Lane {
         Lane(half::f16::from_bits(x[0]).to_f32_const())
+    }
+
+    #[inline(always)]
+    fn load_i32(self, x: &[i32; LANES]) -> Lane {
+        Lane(x[0] as f32)
     }
 }
 
@@ -206,6 +237,22 @@ impl Vector for Lane {
     #[inline(always)]
     fn pow2_of_low_bits(self, bias: i32) -> Lane {
         Lane(f32::from_bits((self.0.to_bits() << 23).wrapping_add((bias as u32) << 23)))
+    }
+
+    #[inline(always)]
+    fn negate(self, lanes: u16) -> Lane {
+        Lane(f32::from_bits(self.0.to_bits() ^ (u32::from(lanes & 1) << 31)))
+    }
+
+    /// The only lane stays.
+    #[inline(always)]
+    fn swap<const H: usize>(self) -> Lane {
+        self
+    }
+
+    #[inline(always)]
+    fn store_s8(self, x: &mut [i8; LANES]) {
+        x[0] = round_s8(self.0);
     }
 }
 

@@ -9,9 +9,11 @@ use crate::activation::Map;
 use crate::attention::SoftmaxTile;
 use crate::cpu::{Features, Kernels};
 use crate::gemm::pack::RowPack;
+use crate::gemm::s8::tile::{FinishS8, QuadPack};
 use crate::gemm::tile::Finish;
 use crate::layernorm::NormRow;
 use crate::peak::Width;
+use crate::quantize::QuantizeRow;
 use crate::resize::BilinearRow;
 use crate::rope::RopeRow;
 
@@ -36,6 +38,14 @@ pub struct VectorKernels {
     pub(crate) finish: unsafe fn(Finish),
     /// `gemm::pack::pack_rows`.
     pub(crate) pack: unsafe fn(RowPack),
+    /// `gemm::s8::tile::pack_quads`.
+    pub(crate) pack_quads: unsafe fn(QuadPack),
+    /// `gemm::s8::tile::finish`.
+    pub(crate) finish_s8: unsafe fn(FinishS8),
+    /// `hadamard::rotate`.
+    pub(crate) rotate: unsafe fn(&mut [f32], &[u16], usize),
+    /// `quantize::quantize_row`.
+    pub(crate) quantize: unsafe fn(QuantizeRow) -> f32,
     /// `resize::bilinear_row`.
     pub(crate) bilinear: unsafe fn(BilinearRow),
     /// `peak::peak_body`.
@@ -86,6 +96,22 @@ macro_rules! vector_kernels {
                 crate::gemm::pack::pack_rows($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
+            fn pack_quads(rows: crate::gemm::s8::tile::QuadPack) {
+                crate::gemm::s8::tile::pack_quads($token::new(), rows);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn finish_s8(tile: crate::gemm::s8::tile::FinishS8) {
+                crate::gemm::s8::tile::finish($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn rotate(x: &mut [f32], signs: &[u16], block: usize) {
+                crate::hadamard::rotate($token::new(), x, signs, block);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn quantize(row: crate::quantize::QuantizeRow) -> f32 {
+                crate::quantize::quantize_row($token::new(), row)
+            }
+            $(#[target_feature(enable = $features)])?
             fn bilinear(row: crate::resize::BilinearRow) {
                 crate::resize::bilinear_row($token::new(), row);
             }
@@ -103,6 +129,10 @@ macro_rules! vector_kernels {
                 softmax,
                 finish,
                 pack,
+                pack_quads,
+                finish_s8,
+                rotate,
+                quantize,
                 bilinear,
                 peak,
             }
@@ -155,6 +185,19 @@ impl Kernels {
     pub(crate) fn pack(&self, rows: RowPack) {
         // SAFETY: chosen under the detected features.
         unsafe { (self.vector.pack)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn rotate(&self, x: &mut [f32], signs: &[u16], block: usize) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.rotate)(x, signs, block) }
+    }
+
+    /// The scale of the row.
+    #[inline]
+    pub(crate) fn quantize(&self, row: QuantizeRow) -> f32 {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.quantize)(row) }
     }
 
     #[inline]

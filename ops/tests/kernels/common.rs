@@ -2,7 +2,7 @@
 
 use sf_ops::Ctx;
 use sf_ops::cpu::{Features, Isa, Kernels};
-use sf_ops::gemm::GEMM_F;
+use sf_ops::gemm::{GEMM_F, GEMM_S8};
 use sf_ops::par::Pool;
 use std::sync::Once;
 
@@ -34,13 +34,34 @@ impl Random {
     }
 }
 
+/// Whether this CPU has what a row needs.
+#[cfg(target_arch = "x86_64")]
+fn must_run() -> Vec<(bool, &'static str)> {
+    use std::arch::is_x86_feature_detected as has;
+    vec![
+        (has!("avx2"), "vector_avx2"),
+        (has!("avx2"), "gemm_s8_4x16_avx2"),
+        (has!("avxvnni"), "gemm_s8_6x16_avxvnni"),
+        (has!("avx512bw"), "vector_avx512"),
+        (has!("avx512vnni"), "gemm_s8_12x32_avx512vnni"),
+    ]
+}
+
+/// Whether this CPU has what a row needs.
+#[cfg(target_arch = "aarch64")]
+fn must_run() -> Vec<(bool, &'static str)> {
+    use std::arch::is_aarch64_feature_detected as has;
+    vec![(has!("neon"), "vector_neon"), (has!("neon"), "gemm_s8_4x16_neon"), (has!("dotprod"), "gemm_s8_6x16_neondot")]
+}
+
 /// The distinct kernel sets of this CPU, portable code first. Rows that cannot run here are named once, and
 /// the minimum that must run is asserted.
 pub(crate) fn kernel_sets() -> Vec<&'static Kernels> {
     static REPORT: Once = Once::new();
     let mut sets: Vec<&'static Kernels> = Vec::new();
     for k in Kernels::available() {
-        if sets.iter().all(|s| s.gemm_f32.name != k.gemm_f32.name || s.vector.name != k.vector.name) {
+        let rows = |k: &Kernels| (k.gemm_f32.name, k.gemm_s8.name, k.vector.name);
+        if sets.iter().all(|s| rows(s) != rows(k)) {
             sets.push(k);
         }
     }
@@ -48,15 +69,15 @@ pub(crate) fn kernel_sets() -> Vec<&'static Kernels> {
         for row in GEMM_F.iter().filter(|r| !Features::detected().has(r.needs)) {
             println!("not run on this CPU: {}", row.name);
         }
+        for row in GEMM_S8.iter().filter(|r| !Features::detected().has(r.needs)) {
+            println!("not run on this CPU: {}", row.name);
+        }
     });
     assert_eq!(sets[0].isa, Isa::Scalar);
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        assert!(sets.iter().any(|k| k.vector.name == "vector_avx2"), "the AVX2 rows must run on this CPU");
-    }
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx512bw") {
-        assert!(sets.iter().any(|k| k.vector.name == "vector_avx512"), "the AVX-512 rows must run on this CPU");
+    // The minimum that must run, by what the CPU says of itself.
+    let ran = |name: &str| sets.iter().any(|k| k.vector.name == name || k.gemm_s8.name == name);
+    for (has, name) in must_run() {
+        assert!(!has || ran(name), "{name} must run on this CPU");
     }
     sets
 }
@@ -67,12 +88,12 @@ pub(crate) fn everywhere(mut f: impl FnMut(Ctx, &str)) {
     let sets = kernel_sets();
     let pool = Pool::new(1).unwrap();
     for kernels in &sets {
-        f(Ctx { pool: &pool, kernels }, kernels.vector.name);
+        f(Ctx { pool: &pool, kernels }, kernels.isa.name());
     }
     for threads in [2, 3] {
         let pool = Pool::new(threads).unwrap();
         let kernels = sets[sets.len() - 1];
-        f(Ctx { pool: &pool, kernels }, &format!("{} on {threads} threads", kernels.vector.name));
+        f(Ctx { pool: &pool, kernels }, &format!("{} on {threads} threads", kernels.isa.name()));
     }
 }
 

@@ -4,7 +4,12 @@
 use crate::common::{Random, everywhere};
 use sf_ops::attention::{FrameMask, attention, scratch_len};
 use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
-use sf_ops::gemm::{Act, Epilogue, Panels, gemm, pack_f16, pack_f32, panel_len};
+use sf_ops::gemm::{
+    Act, Epilogue, Panels, PanelsS8, RowsS8, RowsS8Mut, col_sums, gemm, gemm_s8, pack_f16, pack_f32, pack_s8, padded_k,
+    panel_len, panel_len_s8,
+};
+use sf_ops::hadamard::Rotation;
+use sf_ops::quantize::{Before, Norm, quantize};
 use sf_ops::resize::{Corners, Filter, bilinear, position_table, resample_u8};
 use sf_ops::rope::{AngleRound, QkNorm, RopeTable, qk_norm_rope};
 use sf_ops::{Ctx, Hwc, HwcMut, Mat, MatMut, elementwise, layernorm, trig};
@@ -75,6 +80,29 @@ fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
         h.values(&y);
     });
 
+    let (m, n, k) = (29, 53, 1104);
+    let bytes: Vec<i8> = (0..n * k).map(|i| (i * 89 % 255) as u8 as i8).map(|v| v.max(-127)).collect();
+    let mut packed = vec![0; panel_len_s8(n, k)];
+    pack_s8(&bytes, n, k, &mut packed);
+    let (sums, step) = (col_sums(&packed, n, k), vec![0.003; n]);
+    let signs: Vec<u16> = (0..k as u32 / 16).map(|i| (i * 40_503) as u16).collect();
+    let tokens_in: Vec<f32> = (0..m * k).map(|i| ((i * 7919 % 4093) as f32 - 2046.0) * 0.0007).collect();
+    add("int8", &mut |h| {
+        let (mut data, mut scales) = (vec![0; m * padded_k(k)], vec![0.0; m]);
+        let norm = Norm { affine: Some((&tokens_in[..k], &tokens_in[7..k + 7])), eps: 1e-6 };
+        let before = Before { norm: Some(norm), rotation: Some(Rotation::new(k, &signs)) };
+        let rows = RowsS8Mut { m, k, data: &mut data, scales: &mut scales };
+        quantize(ctx, Mat::new(&tokens_in, m, k), before, rows);
+        h.bytes(data.iter().map(|v| *v as u8));
+        h.values(&scales);
+        let w = PanelsS8 { n, k, data: &packed, scales: &step, col_sums: &sums };
+        let ep = Epilogue { bias: Some(&bias), act: Act::Gelu, gamma: Some(&bias), residual: true };
+        let mut y = vec![0.25; m * n];
+        let rows = RowsS8 { m, k, data: &data, scales: &scales };
+        gemm_s8(ctx, rows, w, ep, MatMut::new(&mut y, m, n));
+        h.values(&y);
+    });
+
     let image = r.vec(9 * 11 * 5);
     let kernel = r.vec(19 * 45);
     let mut panels = vec![0.0; panel_len(19, 45)];
@@ -134,11 +162,12 @@ fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
 
 #[test]
 fn one_hash_on_every_architecture() {
-    let expected: [(&str, u64); 9] = [
+    let expected: [(&str, u64); 10] = [
         ("gemm", 0x3b38_01f7_f874_0f00),
         ("layernorm", 0x8906_f5da_73ab_4ea7),
         ("rope", 0xa9fc_176d_24de_7e1c),
         ("attention", 0x60ab_c85b_fb17_8428),
+        ("int8", 0x2470_8ce5_2820_2599),
         ("conv2d", 0x5dd3_78aa_c81e_9282),
         ("conv_transpose", 0xe266_fa32_c915_87fd),
         ("bilinear", 0x3aeb_e860_cceb_c040),

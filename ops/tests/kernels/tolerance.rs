@@ -39,3 +39,10 @@ pub(crate) const ATTENTION: f32 = 6e-6;
 
 /// Two fused interpolations of values of unit size.
 pub(crate) const BILINEAR: f32 = 4.0 * HALF_ULP;
+
+/// A Hadamard block of 128 values of unit size: seven levels of sums up to 128, then the factor 1/sqrt(128). Seven half-ulps of
+/// 128 over 11.3, rarely a fifth of it.
+pub(crate) const HADAMARD: f32 = 7.0 * HALF_ULP * 128.0 / 11.3;
+
+/// Scales of two ways to the same row, relative: the roundings of a rotation's sums and factor.
+pub(crate) const SCALE: f32 = 4e-6;

@@ -1,0 +1,266 @@
+//! out = epilogue(A W^T) with int8 activations and weights: exact i32 sums, then one f32 epilogue.
+//!
+//! y = fma(f32(sum), row scale * output scale, bias), the product of the scales rounded once; then activation, gamma and
+//! residual as in [`Epilogue`]. Sums are exact whatever the kernel, the tiles and the threads, and the epilogue has one
+//! order, so the bits are the same everywhere.
+//!
+//! | file | what |
+//! |---|---|
+//! | `pack.rs` | K4N16 panels, rows of activations |
+//! | `tile.rs` | the tile over `Dot8`, packing of rows, epilogue |
+//! | `table.rs` | the kernels |
+//! | `scalar.rs` `avx2.rs` `avxvnni.rs` `avx512vnni.rs` `neon.rs` `neondot.rs` | one `Dot8` each |
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx2;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx512vnni;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avxvnni;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neondot;
+pub mod pack;
+pub(crate) mod scalar;
+pub mod table;
+pub(crate) mod tile;
+
+use super::Epilogue;
+use super::pack::{MAX_MR, NR};
+use crate::cpu::Ctx;
+use crate::mat::MatMut;
+use crate::par::SharedMut;
+use pack::{PanelsS8, QUAD, RowsS8, STEP, padded_k};
+use table::{Activations, GemmS8Kernel};
+use tile::{ColumnsS8, FinishS8, MAX_NV, QuadPack, TileS8};
+
+/// Packed activations of one task, in quads: at most 256 KiB, a quarter of a usual second-level cache, so that the
+/// panels streaming past do not drive them out.
+const PACKED: usize = 1 << 16;
+/// Most tiles of rows per task.
+const TILES: usize = 8;
+/// Steps of four inputs between which sums stay in registers: a pair of panels is then 32 KiB.
+const STEPS: usize = 256;
+/// Tasks wanted, so that a few threads finish together.
+const TASKS: usize = 32;
+/// Fewest panels per task: packing the rows again costs about 3 % of 256 columns' dot products.
+const GROUP: usize = 16;
+
+/// Most f32-sized values of working memory that each thread of the pool keeps after int8 products of up to `k` inputs,
+/// whatever the kernel; for memory plans.
+pub fn working_memory_s8(k: usize) -> usize {
+    PACKED.max(MAX_MR * padded_k(k) / QUAD) + TILES * MAX_MR * MAX_NV * NR
+}
+
+/// Where sums go.
+enum Sink<'a> {
+    /// As they are, `[m, n]`.
+    Sums(SharedMut<'a, i32>),
+    /// Through the epilogue into rows `stride` apart.
+    Values { ep: Epilogue<'a>, out: SharedMut<'a, f32>, stride: usize },
+}
+
+struct Product<'a> {
+    kernel: &'static GemmS8Kernel,
+    a: RowsS8<'a>,
+    w: PanelsS8<'a>,
+    sink: Sink<'a>,
+}
+
+/// Rows and panels of one task.
+#[derive(Clone, Copy)]
+struct Part {
+    first: usize,
+    rows: usize,
+    panel: usize,
+    panels: usize,
+}
+
+/// Piece `i` of `total` cut into `pieces` as even as possible.
+fn piece(total: usize, pieces: usize, i: usize) -> std::ops::Range<usize> {
+    i * total / pieces..(i + 1) * total / pieces
+}
+
+/// Runs a product: tasks are blocks of row tiles times groups of panels, chosen by the shape alone.
+fn product(ctx: Ctx, p: &Product) {
+    let (m, n) = (p.a.m, p.w.n);
+    if m == 0 || n == 0 {
+        return;
+    }
+    let steps = padded_k(p.w.k) / QUAD;
+    let (mr, nv) = (p.kernel.mr, p.kernel.nr / NR);
+    let row_tiles = m.div_ceil(mr);
+    let most = (PACKED / (mr * steps.max(1))).clamp(1, TILES);
+    let row_tasks = row_tiles.div_ceil(most);
+    // Whole groups of the kernel's panels.
+    let groups = n.div_ceil(NR).div_ceil(nv);
+    let col_tasks = TASKS.div_ceil(row_tasks).clamp(1, (groups * nv).div_ceil(GROUP));
+    let block = row_tiles.div_ceil(row_tasks) * mr;
+
+    let scratch = block * (steps + nv * NR);
+    assert!(scratch <= working_memory_s8(p.w.k), "{scratch} values of working memory for {} inputs", p.w.k);
+    ctx.pool.reserve_scratch(scratch);
+    ctx.pool.run(row_tasks * col_tasks, &|task, worker| {
+        let tiles = piece(row_tiles, row_tasks, task / col_tasks);
+        let columns = piece(groups, col_tasks, task % col_tasks);
+        let first = tiles.start * mr;
+        let rows = (tiles.end * mr).min(m) - first;
+        ctx.pool.with_scratch(worker, scratch, |memory| {
+            let (packed, acc) = memory.split_at_mut(block * steps);
+            let packed: &mut [u32] = bytemuck::cast_slice_mut(packed);
+            let acc: &mut [i32] = bytemuck::cast_slice_mut(acc);
+            pack_block(ctx, p, first..first + rows, packed);
+            for g in columns {
+                let panel = g * nv;
+                let panels = nv.min(n.div_ceil(NR) - panel);
+                block_of_panels(ctx, p, Part { first, rows, panel, panels }, (packed, acc));
+            }
+        });
+    });
+}
+
+/// Rows of a task to tiles `[tile][step][row]`.
+fn pack_block(ctx: Ctx, p: &Product, rows: std::ops::Range<usize>, packed: &mut [u32]) {
+    let width = padded_k(p.w.k);
+    let steps = width / QUAD;
+    let flip = match p.kernel.activations {
+        Activations::Signed => 0,
+        Activations::Offset128 => 0x8080_8080,
+    };
+    for r in (0..rows.len()).step_by(p.kernel.mr) {
+        let here = p.kernel.mr.min(rows.len() - r);
+        let mut from: [&[i8]; MAX_MR] = [&[]; MAX_MR];
+        for (i, row) in from.iter_mut().enumerate().take(here) {
+            *row = &p.a.data[(rows.start + r + i) * width..][..width];
+        }
+        let width = p.kernel.fit(here);
+        ctx.kernels.pack_quads(QuadPack { from, steps, width, flip, out: &mut packed[r * steps..] });
+    }
+}
+
+/// One group of panels over the rows of a task.
+fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[u32], &mut [i32])) {
+    let steps = padded_k(p.w.k) / QUAD;
+    let mr = p.kernel.mr;
+    let packed: &[i8] = bytemuck::cast_slice(packed);
+    let mut columns = ColumnsS8::default();
+    let mut start = [[0i32; NR]; MAX_NV];
+    let ep = match &p.sink {
+        Sink::Sums(_) => Epilogue::default(),
+        Sink::Values { ep, .. } => *ep,
+    };
+    for v in 0..part.panels {
+        let col = (part.panel + v) * NR;
+        let cols = NR.min(p.w.n - col);
+        columns.scales[v][..cols].copy_from_slice(&p.w.scales[col..col + cols]);
+        if let Some(bias) = ep.bias {
+            columns.bias[v][..cols].copy_from_slice(&bias[col..col + cols]);
+        }
+        if let Some(gamma) = ep.gamma {
+            columns.gamma[v][..cols].copy_from_slice(&gamma[col..col + cols]);
+        }
+        if p.kernel.activations == Activations::Offset128 {
+            for (s, sum) in start[v].iter_mut().zip(&p.w.col_sums[col..col + cols]) {
+                *s = -128 * sum;
+            }
+        }
+    }
+    let w = &p.w.data[part.panel * steps * STEP..];
+    let size = mr * NR * part.panels;
+    let mut s0 = 0;
+    loop {
+        let here = STEPS.min(steps - s0);
+        let last = s0 + here == steps;
+        for (tile, r) in (0..part.rows).step_by(mr).enumerate() {
+            let rows = mr.min(part.rows - r);
+            let width = p.kernel.fit(rows);
+            let acc = &mut acc[tile * size..][..size];
+            ctx.kernels.tile_s8(TileS8 {
+                rows: width,
+                panels: part.panels,
+                steps: here,
+                a: &packed[(r * steps + s0 * width) * QUAD..][..here * width * QUAD],
+                w: &w[s0 * STEP..],
+                w_stride: steps * STEP,
+                start: if s0 == 0 { Some(&start) } else { None },
+                acc,
+                acc_stride: mr * NR,
+            });
+            if last {
+                finish_tile(ctx, p, Part { first: part.first + r, rows, ..part }, (&columns, acc));
+            }
+        }
+        if last {
+            return;
+        }
+        s0 += here;
+    }
+}
+
+/// Sums of one tile to the output.
+fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &[i32])) {
+    let col = part.panel * NR;
+    let cols = (part.panels * NR).min(p.w.n - col);
+    let acc_stride = p.kernel.mr * NR;
+    match &p.sink {
+        Sink::Sums(out) => {
+            for r in 0..part.rows {
+                let at = (part.first + r) * p.w.n + col;
+                // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
+                #[allow(unsafe_code)]
+                let out = unsafe { out.slice(at..at + cols) };
+                for (v, out) in out.chunks_mut(NR).enumerate() {
+                    out.copy_from_slice(&acc[v * acc_stride + r * NR..][..out.len()]);
+                }
+            }
+        }
+        Sink::Values { ep, out, stride } => {
+            let mut rows: [&mut [f32]; MAX_MR] = Default::default();
+            for (r, row) in rows.iter_mut().enumerate().take(part.rows) {
+                let at = (part.first + r) * stride + col;
+                // SAFETY: every output belongs to one tile of one task, and a piece lives only in this call.
+                #[allow(unsafe_code)]
+                let out = unsafe { out.slice(at..at + cols) };
+                *row = out;
+            }
+            ctx.kernels.finish_s8(FinishS8 {
+                acc,
+                acc_stride,
+                panels: part.panels,
+                row_scales: &p.a.scales[part.first..part.first + part.rows],
+                columns,
+                act: ep.act,
+                gamma: ep.gamma.is_some(),
+                residual: ep.residual,
+                out: rows,
+            });
+        }
+    }
+}
+
+fn checked<'a>(a: RowsS8<'a>, w: PanelsS8<'a>) -> (RowsS8<'a>, PanelsS8<'a>) {
+    let (a, w) = (a.checked(), w.checked());
+    assert_eq!(a.k, w.k, "inputs of an int8 product");
+    (a, w)
+}
+
+/// `a` `[m, k]` times the transpose of `w` `[n, k]` -> `out` `[m, n]`:
+/// y = act(fma(f32(sum), row scale * output scale, bias)), y = y * gamma, out = out + y with `residual`, else y.
+pub fn gemm_s8(ctx: Ctx, a: RowsS8, w: PanelsS8, ep: Epilogue, out: MatMut) {
+    let (a, w) = checked(a, w);
+    assert_eq!((out.rows, out.cols), (a.m, w.n), "outputs of an int8 product");
+    for (what, v) in [("bias", ep.bias), ("gamma", ep.gamma)] {
+        assert!(v.is_none_or(|v| v.len() == w.n), "{what} of {} outputs", w.n);
+    }
+    let stride = out.stride;
+    let sink = Sink::Values { ep, out: SharedMut::new(out.data), stride };
+    product(ctx, &Product { kernel: ctx.kernels.gemm_s8, a, w, sink });
+}
+
+/// The exact sums of [`gemm_s8`], `[m, n]`: what every kernel must agree on.
+pub fn gemm_s8_sums(ctx: Ctx, a: RowsS8, w: PanelsS8, out: &mut [i32]) {
+    let (a, w) = checked(a, w);
+    assert_eq!(out.len(), a.m * w.n, "outputs of an int8 product");
+    product(ctx, &Product { kernel: ctx.kernels.gemm_s8, a, w, sink: Sink::Sums(SharedMut::new(out)) });
+}

@@ -1,0 +1,144 @@
+//! The list of int8 matrix kernels, best first. Selection, tests, benches and `doctor` read it.
+#![allow(unsafe_code)]
+
+use super::scalar;
+use super::tile::{FinishS8, QuadPack, TileS8};
+#[cfg(target_arch = "x86_64")]
+use super::{avx2, avx512vnni, avxvnni};
+#[cfg(target_arch = "aarch64")]
+use super::{neon, neondot};
+use crate::cpu::{Features, Kernels};
+
+/// How a kernel takes the bytes of activations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Activations {
+    /// As they are.
+    Signed,
+    /// As s8 + 128, unsigned; sums start at -128 times the sum of the output's weights.
+    Offset128,
+}
+
+/// One kernel of the int8 family: s8 activations, s8 weights, exact i32 sums.
+#[derive(Debug)]
+pub struct GemmS8Kernel {
+    /// `gemm_s8_{rows}x{columns}_{isa}`.
+    pub name: &'static str,
+    /// Features it needs.
+    pub needs: Features,
+    /// Rows of the full tile.
+    pub mr: usize,
+    /// Columns of the full tile, a multiple of 16.
+    pub nr: usize,
+    /// Row counts it can run, ascending; the last is `mr`. Fewer rows are packed up to the next one.
+    pub rows: &'static [usize],
+    /// How it takes activations.
+    pub activations: Activations,
+    pub(crate) run: unsafe fn(TileS8),
+    pub(crate) peak: unsafe fn(i32) -> i32,
+}
+
+impl GemmS8Kernel {
+    /// Smallest row count it can run that holds `rows` (`rows <= mr`).
+    pub(crate) fn fit(&self, rows: usize) -> usize {
+        *self.rows.iter().find(|&&r| r >= rows).expect("at most mr rows")
+    }
+}
+
+/// Every kernel of the family.
+pub static GEMM_S8: &[GemmS8Kernel] = &[
+    #[cfg(target_arch = "x86_64")]
+    GemmS8Kernel {
+        name: "gemm_s8_12x32_avx512vnni",
+        needs: Features::AVX2.with(Features::AVX512).with(Features::AVX512_VNNI),
+        mr: 12,
+        nr: 32,
+        rows: &[1, 2, 4, 6, 8, 10, 12],
+        activations: Activations::Offset128,
+        run: avx512vnni::gemm_s8,
+        peak: avx512vnni::peak_s8,
+    },
+    #[cfg(target_arch = "x86_64")]
+    GemmS8Kernel {
+        name: "gemm_s8_6x16_avxvnni",
+        needs: Features::AVX2.with(Features::AVX_VNNI),
+        mr: 6,
+        nr: 16,
+        rows: &[1, 2, 3, 4, 5, 6],
+        activations: Activations::Offset128,
+        run: avxvnni::gemm_s8,
+        peak: avxvnni::peak_s8,
+    },
+    #[cfg(target_arch = "x86_64")]
+    GemmS8Kernel {
+        name: "gemm_s8_4x16_avx2",
+        needs: Features::AVX2,
+        mr: 4,
+        nr: 16,
+        rows: &[1, 2, 3, 4],
+        activations: Activations::Signed,
+        run: avx2::gemm_s8,
+        peak: avx2::peak_s8,
+    },
+    #[cfg(target_arch = "aarch64")]
+    GemmS8Kernel {
+        name: "gemm_s8_6x16_neondot",
+        needs: Features::NEON.with(Features::NEON_DOT),
+        mr: 6,
+        nr: 16,
+        rows: &[1, 2, 3, 4, 5, 6],
+        activations: Activations::Signed,
+        run: neondot::gemm_s8,
+        peak: neondot::peak_s8,
+    },
+    #[cfg(target_arch = "aarch64")]
+    GemmS8Kernel {
+        name: "gemm_s8_4x16_neon",
+        needs: Features::NEON,
+        mr: 4,
+        nr: 16,
+        rows: &[1, 2, 3, 4],
+        activations: Activations::Signed,
+        run: neon::gemm_s8,
+        peak: neon::peak_s8,
+    },
+    GemmS8Kernel {
+        name: "gemm_s8_4x16_scalar",
+        needs: Features::NONE,
+        mr: 4,
+        nr: 16,
+        rows: &[1, 2, 4],
+        activations: Activations::Signed,
+        run: scalar::gemm_s8,
+        peak: scalar::peak_s8,
+    },
+];
+
+// A `Kernels` value only holds rows whose needs are among the detected features: the SAFETY argument of every call
+// below. Lengths are checked inside, in safe code.
+impl Kernels {
+    /// Runs one tile.
+    #[inline]
+    pub(crate) fn tile_s8(&self, tile: TileS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.gemm_s8.run)(tile) }
+    }
+
+    /// The peak probe of the int8 kernel.
+    #[inline]
+    pub(crate) fn peak_s8(&self, seed: i32) -> i32 {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.gemm_s8.peak)(seed) }
+    }
+
+    #[inline]
+    pub(crate) fn pack_quads(&self, rows: QuadPack) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.pack_quads)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn finish_s8(&self, tile: FinishS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.finish_s8)(tile) }
+    }
+}

@@ -1,0 +1,135 @@
+//! Random-sign block Hadamard rotation: y = c H (d * x) on each block of a row.
+//!
+//! d is a vector of signs, H the unnormalised Hadamard matrix of order b (Sylvester: H_1 = 1, H_2b = [[H, H], [H, -H]]), c =
+//! 1/sqrt(b). The rotation is orthogonal and spreads outlier channels over the block; weights rotated the same way
+//! give the same products. b is the largest power of two up to 128 that divides the row, whose width must be a multiple
+//! of 16.
+//!
+//! Stages run with distances 1, 2, 4, 8 inside a vector of 16 lanes, then 16, 32, 64 across vectors: only additions and
+//! subtractions in one order, so the bits are the same everywhere. [`rotate_rows`] multiplies by c at the end; fused with
+//! quantization ([`crate::quantize`]) c goes into the row's scale and costs nothing.
+
+use crate::cpu::Ctx;
+use crate::mat::MatMut;
+use crate::par::SharedMut;
+use crate::simd::{LANES, Simd, Vector};
+
+/// Largest block.
+pub const MAX_BLOCK: usize = 128;
+
+/// The rotation of rows of one width.
+#[derive(Clone, Copy, Debug)]
+pub struct Rotation<'a> {
+    width: usize,
+    signs: &'a [u16],
+}
+
+impl<'a> Rotation<'a> {
+    /// Rotation of rows of `width` values, a multiple of 16. Bit i % 16 of `signs[i / 16]` is set where value i is negated.
+    pub fn new(width: usize, signs: &'a [u16]) -> Rotation<'a> {
+        assert!(width > 0 && width.is_multiple_of(LANES), "rotation of {width} values: a multiple of 16 wanted");
+        assert_eq!(signs.len(), width / LANES, "sign words of a rotation of {width} values");
+        Rotation { width, signs }
+    }
+
+    /// Values of a row.
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Sign bits, sixteen a word.
+    pub fn signs(&self) -> &'a [u16] {
+        self.signs
+    }
+
+    /// Values of a block: the largest power of two up to 128 that divides the width.
+    pub fn block(&self) -> usize {
+        block(self.width)
+    }
+
+    /// 1/sqrt(block), to the nearest f32.
+    pub fn normalizer(&self) -> f32 {
+        (1.0 / (self.block() as f64).sqrt()) as f32
+    }
+}
+
+/// The block of rows of `width` values: the largest power of two up to 128 that divides it.
+pub fn block(width: usize) -> usize {
+    1 << width.trailing_zeros().min(MAX_BLOCK.trailing_zeros())
+}
+
+/// Lanes that a stage inside a vector subtracts: those with bit `h` of their number set.
+const fn upper(h: usize) -> u16 {
+    let (mut lanes, mut i) = (0, 0);
+    while i < LANES {
+        if i & h != 0 {
+            lanes |= 1 << i;
+        }
+        i += 1;
+    }
+    lanes
+}
+
+/// Stage of distance H inside a vector: (a, b) -> (a + b, a - b).
+#[inline(always)]
+fn stage<V: Vector, const H: usize>(x: V) -> V {
+    x.swap::<H>() + x.negate(const { upper(H) })
+}
+
+/// Blocks of `N` vectors, unnormalised, in place.
+#[inline(always)]
+fn blocks<S: Simd, const N: usize>(s: S, x: &mut [f32], signs: &[u16]) {
+    let (vectors, _) = x.as_chunks_mut::<LANES>();
+    for (block, signs) in vectors.as_chunks_mut::<N>().0.iter_mut().zip(signs.as_chunks::<N>().0) {
+        let mut v = [s.splat(0.0); N];
+        for i in 0..N {
+            let y = s.load(&block[i]).negate(signs[i]);
+            v[i] = stage::<_, 8>(stage::<_, 4>(stage::<_, 2>(stage::<_, 1>(y))));
+        }
+        let mut h = 1;
+        while h < N {
+            for i in 0..N {
+                if i & h == 0 {
+                    (v[i], v[i + h]) = (v[i] + v[i + h], v[i] - v[i + h]);
+                }
+            }
+            h *= 2;
+        }
+        for i in 0..N {
+            v[i].store(&mut block[i]);
+        }
+    }
+}
+
+/// Rotates a row without the factor 1/sqrt(block).
+#[inline(always)]
+pub(crate) fn rotate<S: Simd>(s: S, x: &mut [f32], signs: &[u16], block: usize) {
+    match block {
+        16 => blocks::<S, 1>(s, x, signs),
+        32 => blocks::<S, 2>(s, x, signs),
+        64 => blocks::<S, 4>(s, x, signs),
+        128 => blocks::<S, 8>(s, x, signs),
+        other => panic!("a Hadamard block of {other}"),
+    }
+}
+
+/// Values of one task: about 64 KiB.
+const TASK: usize = 1 << 14;
+
+/// Rotates every row of `x` in place.
+pub fn rotate_rows(ctx: Ctx, rotation: Rotation, x: MatMut) {
+    let (rows, cols, stride) = (x.rows, x.cols, x.stride);
+    assert_eq!(cols, rotation.width, "width of a rotation");
+    let c = rotation.normalizer();
+    let per_task = (TASK / cols).max(1);
+    let shared = SharedMut::new(x.data);
+    ctx.pool.run(rows.div_ceil(per_task), &|task, _| {
+        for r in task * per_task..((task + 1) * per_task).min(rows) {
+            // SAFETY: rows are disjoint (stride >= cols) and each belongs to one task.
+            #[allow(unsafe_code)]
+            let row = unsafe { shared.slice(r * stride..r * stride + cols) };
+            ctx.kernels.rotate(row, rotation.signs, rotation.block());
+            row.iter_mut().for_each(|v| *v *= c);
+        }
+    });
+}
