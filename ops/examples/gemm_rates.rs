@@ -1,0 +1,150 @@
+//! Speed of the int8 product against the measured int8 peak of this CPU:
+//!
+//! `cargo run --release -p sf-ops --example gemm_rates [ROUNDS]`
+//!
+//! Every shape is checked against the definition first, then timed; times are the best of interleaved rounds. The peak of
+//! two threads is two threads running the probe at once.
+
+use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, col_sums, gemm_s8, gemm_s8_sums, pack_s8, padded_k, panel_len_s8};
+use sf_ops::{Ctx, Kernels, MatMut, par::Pool, peak, reference};
+use std::time::{Duration, Instant};
+
+/// Outputs of a shape checked against the definition: every row of so many columns.
+const CHECKED: usize = 40;
+
+/// (rows, inputs, outputs): a large transformer of 4 frames of 217 tokens, a small one, and few rows.
+const SHAPES: [(usize, usize, usize); 14] = [
+    (868, 1024, 1024),
+    (868, 1024, 3072),
+    (868, 1024, 4096),
+    (868, 4096, 1024),
+    (884, 192, 192),
+    (884, 192, 576),
+    (884, 192, 768),
+    (884, 768, 192),
+    (1, 1024, 1024),
+    (2, 1024, 1024),
+    (4, 1024, 1024),
+    (8, 1024, 1024),
+    (12, 1024, 1024),
+    (16, 1024, 1024),
+];
+
+struct Case {
+    size: (usize, usize, usize),
+    a: Vec<i8>,
+    a_scales: Vec<f32>,
+    w: Vec<i8>,
+    scales: Vec<f32>,
+    sums: Vec<i32>,
+    bias: Vec<f32>,
+    out: Vec<f32>,
+}
+
+impl Case {
+    fn new(size: (usize, usize, usize)) -> Case {
+        let (m, k, n) = size;
+        let mut state = 7u64;
+        let mut next = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            ((state >> 33) % 255) as i8
+        };
+        let mut value = || next().max(-127);
+        let mut a = vec![0i8; m * padded_k(k)];
+        for row in a.chunks_exact_mut(padded_k(k)) {
+            row[..k].fill_with(&mut value);
+        }
+        let plain: Vec<i8> = (0..n * k).map(|_| value()).collect();
+        let mut w = vec![0; panel_len_s8(n, k)];
+        pack_s8(&plain, n, k, &mut w);
+        let sums = col_sums(&w, n, k);
+        let case = Case {
+            size,
+            a,
+            a_scales: vec![0.01; m],
+            w,
+            scales: vec![0.02; n],
+            sums,
+            bias: vec![0.5; n],
+            out: vec![0.0; m * n],
+        };
+        case.check(&plain);
+        case
+    }
+
+    fn rows(&self) -> RowsS8<'_> {
+        RowsS8 { m: self.size.0, k: self.size.1, data: &self.a, scales: &self.a_scales }
+    }
+
+    fn panels(&self) -> PanelsS8<'_> {
+        PanelsS8 { n: self.size.2, k: self.size.1, data: &self.w, scales: &self.scales, col_sums: &self.sums }
+    }
+
+    fn check(&self, plain: &[i8]) {
+        let (m, k, n) = self.size;
+        assert_eq!(k % 4, 0, "shapes of this list need no padding");
+        let pool = Pool::new(2).expect("two threads");
+        let mut y = vec![0; m * n];
+        gemm_s8_sums(Ctx { pool: &pool, kernels: Kernels::best() }, self.rows(), self.panels(), &mut y);
+        let cols = CHECKED.min(n);
+        let expected = reference::gemm_s8(&self.a, &plain[(n - cols) * k..], k);
+        for (y, e) in y.chunks_exact(n).zip(expected.chunks_exact(cols)) {
+            assert_eq!(&y[n - cols..], e, "{m} x {k} x {n}");
+        }
+    }
+
+    /// Seconds of one product.
+    fn time(&mut self, pool: &Pool, act: Act) -> f64 {
+        let (m, _, n) = self.size;
+        let ctx = Ctx { pool, kernels: Kernels::best() };
+        let mut out = std::mem::take(&mut self.out);
+        let ep = Epilogue { bias: Some(&self.bias), act, ..Epilogue::default() };
+        let start = Instant::now();
+        gemm_s8(ctx, self.rows(), self.panels(), ep, MatMut::new(&mut out, m, n));
+        let time = start.elapsed().as_secs_f64();
+        self.out = out;
+        time
+    }
+}
+
+/// Peak of `threads` threads at once.
+fn peak_of(threads: usize) -> f64 {
+    let probe = || peak::s8_ops_per_second(Kernels::best(), Duration::from_millis(40));
+    std::thread::scope(|s| {
+        let others: Vec<_> = (1..threads).map(|_| s.spawn(probe)).collect();
+        probe() + others.into_iter().map(|t| t.join().expect("a probe does not panic")).sum::<f64>()
+    })
+}
+
+fn main() {
+    let rounds: usize = std::env::args().nth(1).and_then(|v| v.parse().ok()).unwrap_or(20);
+    println!("{}, {rounds} rounds", Kernels::best().gemm_s8.name);
+    println!("threads     M     K     N        ms    GOP/s  of peak  with gelu");
+    let mut cases: Vec<Case> = SHAPES.into_iter().map(Case::new).collect();
+    for threads in [1, 2] {
+        let pool = Pool::new(threads).expect("threads");
+        let mut peak = 0.0f64;
+        let mut best = vec![[f64::INFINITY; 2]; cases.len()];
+        for _ in 0..rounds {
+            peak = peak.max(peak_of(threads));
+            for (case, best) in cases.iter_mut().zip(&mut best) {
+                for (best, act) in best.iter_mut().zip([Act::None, Act::Gelu]) {
+                    *best = best.min(case.time(&pool, act)).min(case.time(&pool, act));
+                }
+            }
+        }
+        println!("{threads:7}  peak {:38.0}", peak * 1e-9);
+        for (case, best) in cases.iter().zip(&best) {
+            let (m, k, n) = case.size;
+            let ops = 2.0 * (m * k * n) as f64;
+            let share = best.map(|t| 100.0 * ops / t / peak);
+            println!(
+                "{threads:7} {m:5} {k:5} {n:5} {:9.3} {:8.0} {:6.1} % {:8.1} %",
+                best[0] * 1e3,
+                ops / best[0] * 1e-9,
+                share[0],
+                share[1]
+            );
+        }
+    }
+}
