@@ -7,14 +7,15 @@
 
 use crate::block::{self, Net, Sight};
 use crate::embed;
-use crate::plan::{Dims, Plan, is_global};
+use crate::plan::Plan;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
 use sf_formats::Result;
+use sf_formats::config::{ModelConfig, Order};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Mat, MatMut};
 
-/// Runs all layers in place on `x` `[frames * tokens, dim]` and fills `pairs` (see [`Pairs`]).
+/// Runs all layers in place on `x` `[frames * tokens, dim]` and fills `pairs` (see [`Pairs`](crate::features::Pairs)).
 ///
 /// On entry the patch rows of `x` hold the encoder's features.
 pub(crate) fn run(
@@ -71,73 +72,7 @@ pub(crate) struct Aggregate<'a> {
     pub(crate) scratch: &'a mut [f32],
 }
 
-/// Tokens that a head reads: `[frames * tokens, columns]` inside wider rows, registers first.
-#[derive(Clone, Copy)]
-pub(crate) struct Features<'a> {
-    data: &'a [f32],
-    /// Width of a stored row; the features are its last `cols` values.
-    stride: usize,
-    cols: usize,
-    tokens: usize,
-    patches: usize,
-    frames: usize,
-}
-
-impl<'a> Features<'a> {
-    /// Rows of exactly their width.
-    pub(crate) fn dense(data: &'a [f32], cols: usize, d: &Dims, tokens: usize) -> Features<'a> {
-        Features { data, stride: cols, cols, tokens, patches: d.patches, frames: d.frames }
-    }
-
-    /// The last `cols` columns.
-    pub(crate) fn last(self, cols: usize) -> Features<'a> {
-        assert!(cols <= self.cols, "{cols} of {} columns", self.cols);
-        Features { cols, ..self }
-    }
-
-    fn rows_from(&self, row: usize, rows: usize) -> Mat<'a> {
-        Mat::with_stride(&self.data[row * self.stride + self.stride - self.cols..], rows, self.cols, self.stride)
-    }
-
-    /// All tokens of all frames.
-    pub(crate) fn all(&self) -> Mat<'a> {
-        self.rows_from(0, self.frames * self.tokens)
-    }
-
-    /// The patch tokens of one frame.
-    pub(crate) fn patches(&self, frame: usize) -> Mat<'a> {
-        self.rows_from((frame + 1) * self.tokens - self.patches, self.patches)
-    }
-
-    /// Tokens per frame.
-    pub(crate) fn tokens(&self) -> usize {
-        self.tokens
-    }
-}
-
-/// The kept pairs.
-#[derive(Clone, Copy)]
-pub(crate) struct Pairs<'a> {
-    data: &'a [f32],
-    plan: &'a Plan,
-    dim: usize,
-}
-
-impl<'a> Pairs<'a> {
-    pub(crate) fn new(data: &'a [f32], plan: &'a Plan, dim: usize) -> Pairs<'a> {
-        Pairs { data, plan, dim }
-    }
-
-    /// Both outputs of pair `index`, side by side.
-    pub(crate) fn get(&self, index: usize) -> Features<'a> {
-        let slot = self.plan.pairs.iter().position(|&p| p == index).expect("the plan keeps every tapped pair");
-        let d = &self.plan.dims;
-        let len = d.frames * d.tokens * 2 * self.dim;
-        Features::dense(&self.data[slot * len..][..len], 2 * self.dim, d, d.tokens)
-    }
-
-    /// Both outputs of the last pair.
-    pub(crate) fn final_pair(&self) -> Features<'a> {
-        self.get(*self.plan.pairs.last().expect("the last pair is always kept"))
-    }
+/// Whether aggregator layer `i` attends over all frames.
+pub(crate) fn is_global(config: &ModelConfig, i: usize) -> bool {
+    (i % 2 == 1) == (config.aa_order == Order::FrameFirst)
 }

@@ -6,14 +6,14 @@
 //! same tokens; where they also share weights, layer 0's norm, q|k|v, q/k norms and rotation are computed
 //! once, which is exact because only the mask differs.
 
-use crate::aggregator::Features;
 use crate::arena::{carve, carved_len};
 use crate::block::{self, BlockShape, Net, Sight};
+use crate::dims::Dims;
 use crate::embed;
+use crate::features::Features;
 use crate::heads::{self, Dense, Source};
 use crate::model::{Block, DenseHead, Model};
 use crate::motion::Reach;
-use crate::plan::Dims;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens, causal_tokens};
 use sf_formats::Result;

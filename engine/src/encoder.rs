@@ -6,7 +6,8 @@
 
 use crate::arena::carve;
 use crate::block::{self, Net, Sight};
-use crate::plan::{Dims, patch_lens};
+use crate::dims::Dims;
+use crate::plan::patch_lens;
 use crate::preprocess::Normaliser;
 use crate::probe::Probe;
 use crate::tables::Tables;

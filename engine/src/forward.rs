@@ -3,16 +3,18 @@
 //! One file per stage does the work; this one hands them their memory. Stages never overlap in time, so all
 //! of them use the same working area.
 
-use crate::aggregator::{self, Features, Pairs};
+use crate::aggregator;
 use crate::arena::carve;
 use crate::block::Net;
+use crate::dims::{ClipShape, Dims};
+use crate::features::{Features, Pairs};
 use crate::heads::camera::{self, RawCamera};
 use crate::heads::{self, Dense, Source};
 use crate::input::Input;
 use crate::intrinsics::{self, Evidence};
 use crate::model::{DenseHead, Model};
 use crate::output::{Flags, Output};
-use crate::plan::{ClipShape, Dims, Plan, trunk_lens};
+use crate::plan::{Plan, trunk_lens};
 use crate::probe::Probe;
 use crate::tables::{DptTables, Tables, Tokens};
 use crate::unproject::{self, View};
@@ -111,7 +113,8 @@ impl Forward<'_> {
             let to = aggregator::Aggregate { x: tokens, pairs, scratch };
             aggregator::run(self.net, self.plan, self.tables, self.input.times, to, probe)?;
         }
-        let pairs = Pairs::new(pairs, self.plan, self.config.aa.dim as usize);
+        let pairs =
+            Pairs { data: pairs, kept: &self.plan.pairs, dims: &self.plan.dims, dim: self.config.aa.dim as usize };
         self.poses(pairs, work, memory, probe)?;
         self.depth(pairs, work, &mut memory.output, probe)?;
         self.confidence(pairs, work, &mut memory.output, probe)?;

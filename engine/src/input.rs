@@ -1,6 +1,6 @@
 //! What a run reads: frames at the network's size, their times, and intrinsics where they are known.
 
-use crate::plan::ClipShape;
+use crate::dims::ClipShape;
 use sf_formats::{Error, Intrinsics, Result};
 
 /// One clip at the network's size.

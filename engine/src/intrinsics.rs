@@ -8,7 +8,7 @@
 //! Sums are f64, pixel after pixel in memory order, one frame after the other: the same bits for any
 //! number of threads.
 
-use crate::plan::Dims;
+use crate::dims::Dims;
 use sf_formats::Intrinsics;
 use sf_formats::config::{KSource, ModelConfig};
 use sf_ops::trig;

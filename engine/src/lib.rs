@@ -4,12 +4,14 @@
 //! |---|---|
 //! | `model.rs` | [`Model`]: a weight blob and typed handles into it |
 //! | `session.rs` | [`Session`]: a model ready for clips of one shape; [`Options`] |
+//! | `dims.rs` | [`ClipShape`]: what a session is made for, checked once; its token counts |
 //! | `plan.rs` `arena.rs` | [`Plan`]: every size before the first frame; the one block of memory |
 //! | `input.rs` `preprocess.rs` | [`Input`]: frames at the network's size; resizing to it |
 //! | `forward.rs` | the order of the network |
 //! | `encoder.rs` | DINOv2 with registers, frame by frame |
 //! | `aggregator.rs` | alternating frame and global attention |
 //! | `block.rs` | the one transformer block |
+//! | `features.rs` | the tokens that heads read, where they lie |
 //! | `heads/` | camera, linear and DPT heads |
 //! | `causal.rs` | the two masked passes over time |
 //! | `rotation.rs` `intrinsics.rs` `unproject.rs` | poses, focal lengths, centres |
@@ -45,8 +47,10 @@ mod aggregator;
 mod arena;
 mod block;
 mod causal;
+mod dims;
 mod embed;
 mod encoder;
+mod features;
 mod forward;
 mod gaussians;
 mod heads;
@@ -64,11 +68,12 @@ mod session;
 mod tables;
 mod unproject;
 
+pub use dims::{ClipShape, MAX_FRAMES, MAX_PIXELS, MAX_TOKENS};
 pub use gaussians::CONF_MIN;
 pub use input::Input;
 pub use model::Model;
 pub use output::{Flags, FrameSource, Output};
-pub use plan::{ClipShape, DEFAULT_MAX_BYTES, MAX_FRAMES, MAX_PIXELS, MAX_TOKENS, Plan};
+pub use plan::{DEFAULT_MAX_BYTES, Plan};
 pub use preprocess::{Prepared, SourceFrame};
 pub use probe::{Tap, TapFn};
 pub use session::{MAX_THREADS, Options, Session, StageTime};

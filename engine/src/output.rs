@@ -1,8 +1,8 @@
 //! [`Output`]: what the network says about one clip; and the [`Scene`] made of it.
 
 use crate::arena::filled;
+use crate::dims::ClipShape;
 use crate::gaussians::CONF_MIN;
-use crate::plan::ClipShape;
 use sf_formats::config::{ModelConfig, Sky};
 use sf_formats::scene::{Compose, SceneFrame, SplatSettings};
 use sf_formats::{Camera, Gaussians, Intrinsics, Pose, Result, Scene};

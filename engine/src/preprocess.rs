@@ -4,9 +4,9 @@
 //! Frames are resized, never padded: padding would create tokens that enter global attention and the
 //! intrinsics fit. The resize is bit-exact with Pillow's 8-bit one.
 
+use crate::dims::{ClipShape, Dims};
 use crate::input::Input;
 use crate::output::FrameSource;
-use crate::plan::ClipShape;
 use sf_formats::clip::Clip;
 use sf_formats::config::{ModelConfig, Resample};
 use sf_formats::{Error, Intrinsics, Result};
@@ -104,7 +104,7 @@ pub fn prepare(
     let shape = ClipShape { frames: frames.len(), height: size.1 as usize, width: size.0 as usize };
     let _mode = DefaultFloatMode::enter();
     // Caps before the allocation below.
-    crate::plan::dims(config, shape)?;
+    Dims::new(config, shape)?;
     let filter = match config.image_resample {
         Resample::Bicubic => Filter::Bicubic,
         Resample::Lanczos => Filter::Lanczos3,

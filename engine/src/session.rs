@@ -5,11 +5,12 @@
 
 use crate::arena::{Arena, carve, carved_len, filled};
 use crate::block::Net;
+use crate::dims::ClipShape;
 use crate::forward::{self, Areas, Forward, Memory};
 use crate::input::Input;
 use crate::model::Model;
 use crate::output::Output;
-use crate::plan::{ClipShape, DEFAULT_MAX_BYTES, Plan};
+use crate::plan::{DEFAULT_MAX_BYTES, Plan};
 use crate::probe::{Probe, STAGES, TapFn};
 use crate::tables::Tables;
 use sf_formats::{Error, Intrinsics, Result};

@@ -1,8 +1,8 @@
 //! Tables that depend on the clip shape alone: computed once per session.
 
+use crate::dims::Dims;
 use crate::embed::PositionEmbedding;
 use crate::model::{DenseHead, Dpt, Model};
-use crate::plan::Dims;
 use sf_formats::config::{AngleRound, ModelConfig};
 use sf_ops::rope::{self, RopeTable};
 

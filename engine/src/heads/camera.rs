@@ -4,11 +4,11 @@
 //! layers with ReLU, then translation, nine rotation numbers, and log focal lengths where the file has them.
 
 use super::decoder;
-use crate::aggregator::Features;
 use crate::arena::{carve, carved_len};
 use crate::block::Net;
+use crate::dims::Dims;
+use crate::features::Features;
 use crate::model::{self, Linear};
-use crate::plan::Dims;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
 use sf_formats::Result;

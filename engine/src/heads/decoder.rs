@@ -1,11 +1,11 @@
 //! Pi3's transformer decoder: projection, frame-local blocks with rotary positions, projection (network
 //! specification 1.3, step 8). No layer scale, no q/k norms.
 
-use crate::aggregator::Features;
 use crate::arena::{carve, carved_len};
 use crate::block::{self, BlockShape, Net, Sight};
+use crate::dims::Dims;
+use crate::features::Features;
 use crate::model::Decoder;
-use crate::plan::Dims;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
 use sf_formats::Result;
@@ -32,6 +32,16 @@ pub(crate) struct Job<'a> {
     pub(crate) tokens: Tokens,
 }
 
+impl Job<'_> {
+    /// Tokens per frame.
+    pub(crate) fn per_frame(&self, d: &Dims) -> usize {
+        match self.tokens {
+            Tokens::WithRegisters => self.x.tokens(),
+            Tokens::Patches => d.patches,
+        }
+    }
+}
+
 /// Runs the decoder; `out` receives `[frames, tokens, linear_out]`, registers included where they take
 /// part.
 pub(crate) fn run(
@@ -42,10 +52,7 @@ pub(crate) fn run(
     (scratch, out): (&mut [f32], &mut [f32]),
     probe: &Probe,
 ) -> Result<()> {
-    let per_frame = match job.tokens {
-        Tokens::WithRegisters => job.x.tokens(),
-        Tokens::Patches => d.patches,
-    };
+    let per_frame = job.per_frame(d);
     let dim = decoder.projects.weight.n;
     let rows = d.frames * per_frame;
     let [x, scratch] = carve(scratch, lens(decoder, d, per_frame, net.ctx.pool.threads()));

@@ -12,11 +12,11 @@
 //! bilinear weights sum to one, so they commute, and there are four times fewer pixels before.
 //! RCU(x) = conv2(relu(conv1(relu(x)))) + relu(x), or + x with the `raw` skip.
 
-use crate::aggregator::Features;
 use crate::arena::{carve, carved_len};
 use crate::block::Net;
+use crate::dims::Dims;
+use crate::features::Features;
 use crate::model::{Dpt, Linear, Unit};
-use crate::plan::Dims;
 use crate::tables::DptTables;
 use sf_formats::config::RcuSkip;
 use sf_ops::conv::{self, Conv, ConvTranspose};

@@ -2,13 +2,13 @@
 //!
 //! Row c patch^2 + dy patch + dx of the linear layer fills pixel (patch y + dy, patch x + dx) of channel c.
 
-use super::{Dense, decoder};
-use crate::aggregator::Features;
+use super::decoder::{self, Job};
 use crate::arena::{carve, carved_len};
+use crate::block::Net;
+use crate::dims::Dims;
 use crate::model::LinearHead;
-use crate::plan::Dims;
 use crate::probe::Probe;
-use crate::tables::Tokens;
+use crate::tables::Tables;
 use sf_formats::Result;
 use sf_ops::elementwise::pixel_shuffle;
 use sf_ops::gemm::Act;
@@ -26,43 +26,34 @@ pub(crate) fn scratch_len(head: &LinearHead, d: &Dims, tokens: usize, threads: u
     carved_len(lens(head, d, tokens, threads))
 }
 
-/// Decoder tokens per frame.
-fn per_frame(dense: &Dense, x: &Features) -> usize {
-    match dense.tokens {
-        Tokens::WithRegisters => x.tokens(),
-        Tokens::Patches => dense.dims.patches,
-    }
-}
-
 /// Decodes the tokens of all frames; they stay at the start of `scratch`.
 pub(crate) fn prepare(
-    dense: &Dense,
+    net: Net,
     head: &LinearHead,
-    x: Features,
+    (d, tables): (&Dims, &Tables),
+    job: Job,
     scratch: &mut [f32],
-    probe: &mut Probe,
+    probe: &Probe,
 ) -> Result<()> {
-    let [decoded, work] = carve(scratch, lens(head, dense.dims, per_frame(dense, &x), dense.net.ctx.pool.threads()));
-    let job = decoder::Job { name: dense.name, x, tokens: dense.tokens };
-    decoder::run(dense.net, &head.decoder, (dense.dims, dense.tables), job, (work, decoded), probe)
+    let [decoded, work] = carve(scratch, lens(head, d, job.per_frame(d), net.ctx.pool.threads()));
+    decoder::run(net, &head.decoder, (d, tables), job, (work, decoded), probe)
 }
 
-/// Patch pixels of one frame, shuffled into its raw map `[height, width, out]`.
+/// Patch pixels of one frame, shuffled into its raw map `[height, width, out]`; `per_frame` tokens were decoded.
 pub(crate) fn frame(
-    dense: &Dense,
+    net: Net,
     head: &LinearHead,
-    x: Features,
+    d: &Dims,
+    per_frame: usize,
     (frame, scratch, out): (usize, &mut [f32], &mut [f32]),
 ) {
-    let d = dense.dims;
-    let per_frame = per_frame(dense, &x);
-    let [decoded, work] = carve(scratch, lens(head, d, per_frame, dense.net.ctx.pool.threads()));
+    let [decoded, work] = carve(scratch, lens(head, d, per_frame, net.ctx.pool.threads()));
     let width = head.decoder.linear_out.weight.n;
     let patches = &decoded[((frame + 1) * per_frame - d.patches) * width..][..d.patches * width];
     let pixels = &mut work[..d.patches * head.proj.weight.n];
     let wide = head.proj.weight.n;
-    dense.net.linear(&head.proj, Act::None, Mat::new(patches, d.patches, width), MatMut::new(pixels, d.patches, wide));
+    net.linear(&head.proj, Act::None, Mat::new(patches, d.patches, width), MatMut::new(pixels, d.patches, wide));
     let patch = d.height / d.rows;
     let out = HwcMut::new(out, d.height, d.width, head.out);
-    pixel_shuffle(dense.net.ctx, Mat::new(pixels, d.patches, wide), (d.rows, d.cols), patch, out);
+    pixel_shuffle(net.ctx, Mat::new(pixels, d.patches, wide), (d.rows, d.cols), patch, out);
 }

@@ -15,10 +15,10 @@ pub(crate) mod decoder;
 pub(crate) mod dpt;
 pub(crate) mod linear;
 
-use crate::aggregator::Features;
 use crate::block::Net;
+use crate::dims::Dims;
+use crate::features::Features;
 use crate::model::DenseHead;
-use crate::plan::Dims;
 use crate::probe::Probe;
 use crate::tables::{DptTables, Tables, Tokens};
 use sf_formats::Result;
@@ -45,10 +45,17 @@ pub(crate) struct Dense<'a> {
 }
 
 impl Dense<'_> {
+    /// What a decoder makes of the tokens.
+    fn job<'x>(&self, x: Features<'x>) -> decoder::Job<'x> {
+        decoder::Job { name: self.name, x, tokens: self.tokens }
+    }
+
     /// The part over all frames; its result stays at the start of `scratch` for [`Dense::frame`].
     pub(crate) fn prepare(&self, source: Source, scratch: &mut [f32], probe: &mut Probe) -> Result<()> {
         match (self.head, source) {
-            (DenseHead::Linear(head), Source::Tokens(x)) => linear::prepare(self, head, x, scratch, probe),
+            (DenseHead::Linear(head), Source::Tokens(x)) => {
+                linear::prepare(self.net, head, (self.dims, self.tables), self.job(x), scratch, probe)
+            }
             (DenseHead::Dpt(_), Source::Taps(_)) => Ok(()),
             _ => unreachable!("the source is chosen by the kind of the head"),
         }
@@ -57,7 +64,9 @@ impl Dense<'_> {
     /// The raw map of one frame, `[height, width, channels]`.
     pub(crate) fn frame(&self, source: Source, frame: usize, scratch: &mut [f32], out: &mut [f32]) {
         match (self.head, source) {
-            (DenseHead::Linear(head), Source::Tokens(x)) => linear::frame(self, head, x, (frame, scratch, out)),
+            (DenseHead::Linear(head), Source::Tokens(x)) => {
+                linear::frame(self.net, head, self.dims, self.job(x).per_frame(self.dims), (frame, scratch, out));
+            }
             (DenseHead::Dpt(head), Source::Taps(taps)) => {
                 let tables = self.dpt.expect("a pyramid has its position tables");
                 dpt::frame(self.net, head, tables, self.dims, dpt::Pyramid { taps, frame, scratch, out });

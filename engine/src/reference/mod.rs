@@ -12,11 +12,12 @@
 
 mod layers;
 
+use crate::aggregator::is_global;
+use crate::dims::Dims;
 use crate::embed;
 use crate::gaussians;
 use crate::intrinsics;
 use crate::motion::{self, Reach};
-use crate::plan::{self, Dims};
 use crate::tables;
 use crate::unproject::{self, View};
 use crate::{Input, preprocess};
@@ -98,7 +99,7 @@ impl Stages {
 
 /// Runs the network on a clip at the network's size.
 pub fn run(weights: &Weights, config: &ModelConfig, input: &Input) -> Result<Stages> {
-    let d = plan::dims(config, input.shape)?;
+    let d = Dims::new(config, input.shape)?;
     input.check()?;
     let net = Network { w: weights, config, d, input };
     let mut s = Stages::default();
@@ -186,7 +187,7 @@ impl Network<'_> {
         let places = tables::rope_table(c, c.aa.registers as usize, (d.rows, d.cols), dim / c.aa.heads as usize);
         for i in 0..c.aa.depth as usize {
             let own = d.frame_mask(d.tokens);
-            let mask = if plan::is_global(c, i) { d.global_mask() } else { own };
+            let mask = if is_global(c, i) { d.global_mask() } else { own };
             let attention = Attention { mask, rope: Some(&places), ..Attention::own_frame(&c.aa, self.aa(), 0) };
             layers::block(self.w, &format!("decoder.{i}"), &mut x, attention);
             s.put(format!("aa.{i}"), &[d.frames, d.tokens, dim], x.clone());
