@@ -4,7 +4,7 @@
 //! configuration asks for. Everything is checked on opening; afterwards nothing here can fail. The
 //! format is described in `docs/blob-format.md`, its numbers are in [`crate::blob_layout`].
 
-use crate::arch::TensorSpec;
+pub use crate::blob_check::TensorRecord;
 use crate::blob_check::{self, Parsed};
 use crate::blob_layout::HEADER;
 pub use crate::blob_layout::{Dtype, Layout};
@@ -39,23 +39,6 @@ pub enum Verify {
     /// Also every tensor's SHA-256 and that its values are finite; reads the whole file.
     #[default]
     Digests,
-}
-
-/// One tensor of a blob.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct TensorRecord {
-    /// Name, checkpoint shape and role.
-    pub spec: TensorSpec,
-    /// Type of the stored values.
-    pub dtype: Dtype,
-    /// Their order.
-    pub layout: Layout,
-    /// Start in the file; a multiple of 64.
-    pub offset: usize,
-    /// Length in bytes.
-    pub bytes: usize,
-    /// SHA-256 of those bytes.
-    pub digest: Digest,
 }
 
 /// A validated weight file.

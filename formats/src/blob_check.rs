@@ -7,7 +7,6 @@
 //! where it happens to make a NaN.
 
 use crate::arch::{self, TensorSpec};
-use crate::blob::TensorRecord;
 use crate::blob_layout::{self as layout, Dtype, Layout, header, record};
 use crate::config::{ModelConfig, Value};
 use crate::digest::{Digest, hex, sha256};
@@ -19,6 +18,23 @@ use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// One tensor of a blob.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TensorRecord {
+    /// Name, checkpoint shape and role.
+    pub spec: TensorSpec,
+    /// Type of the stored values.
+    pub dtype: Dtype,
+    /// Their order.
+    pub layout: Layout,
+    /// Start in the file; a multiple of 64.
+    pub offset: usize,
+    /// Length in bytes.
+    pub bytes: usize,
+    /// SHA-256 of those bytes.
+    pub digest: Digest,
+}
 
 /// What a valid file says.
 #[derive(Debug)]

@@ -17,7 +17,8 @@
 //! | `atomic.rs` | whole-or-nothing writing: temporary file, then rename |
 //! | `camera.rs` | [`Pose`], [`Intrinsics`], [`Camera`] |
 //! | `checkpoint.rs` | [`checkpoint::open`]: training checkpoints, read tensor by tensor |
-//! | `safetensors_in.rs`, `torch_in.rs` | the two checkpoint formats |
+//! | `checkpoint_source.rs` | [`checkpoint::Checkpoint`]: what every checkpoint format gives |
+//! | `safetensors_in.rs`, `torch_in.rs` | the two formats |
 //! | `clip.rs`, `truth.rs`, `transforms.rs` | [`clip::Clip`]: frames, times, reference poses, ground truth |
 //! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
 //! | `picture.rs` | depth, velocity and other numbers as pictures with a known scale |
@@ -39,6 +40,7 @@ pub mod blob_writer;
 pub mod camera;
 pub mod camera_json;
 pub mod checkpoint;
+mod checkpoint_source;
 pub mod clip;
 pub mod config;
 mod config_check;

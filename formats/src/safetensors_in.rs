@@ -5,7 +5,7 @@
 //! text); then the data, which the offsets count from. Refused here: equal keys, holes, overlaps,
 //! bytes behind the last tensor, zero-size tensors, lengths that are not shape x dtype.
 
-use crate::checkpoint::{Checkpoint, CheckpointTensor, SourceDtype, decode_f32, file_digest};
+use crate::checkpoint_source::{Checkpoint, CheckpointTensor, SourceDtype, decode_f32, file_digest};
 use crate::error::{Error, Result, escape, escape_path};
 use crate::sniff::open_regular;
 use serde_json::Value;

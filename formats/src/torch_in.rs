@@ -5,7 +5,7 @@
 //! choice and what was left aside are in [`Checkpoint::describe`]. Text values at the top level are the
 //! metadata.
 
-use crate::checkpoint::{Checkpoint, CheckpointTensor, SourceDtype, decode_f32, file_digest};
+use crate::checkpoint_source::{Checkpoint, CheckpointTensor, SourceDtype, decode_f32, file_digest};
 use crate::error::{Error, Result, escape, escape_path};
 use pytorch_reader::{DType, PickleError, PickleValue, PytorchError, PytorchReader, Tensor};
 use std::collections::BTreeMap;
