@@ -3,13 +3,15 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | `street.rs` | [`Street`], [`Options`], [`Style`], [`Split`]: a seed becomes a clip |
-//! | `scene.rs`, `frontage.rs`, `traffic.rs` | [`SceneSpec`]: the plan, what stands, what moves |
+//! | `street.rs` | [`Street`], [`Options`], [`Split`]: a seed becomes a clip |
+//! | `style.rs` | [`Style`]: the distribution that streets are drawn from |
+//! | `scene.rs`, `plan.rs`, `frontage.rs`, `traffic.rs` | [`SceneSpec`]: the plan, what stands, what moves |
 //! | `clip.rs`, `stream.rs` | a clip as a folder; many clips as one binary stream |
 //! | `camera_motion.rs`, `motion.rs` | how the camera car and everything else moves, with exact derivatives |
 //! | `ground.rs`, `buildings.rs`, `vegetation.rs`, `furniture.rs`, `vehicles.rs`, `people.rs`, `sky.rs` | what a street is made of |
-//! | `body.rs`, `shape.rs`, `material.rs`, `texture.rs`, `light.rs`, `shadow.rs` | parts, primitives, surfaces |
-//! | `raycast.rs` | from a scene to pixels |
+//! | `facade.rs`, `paint.rs` | what is drawn on houses and vehicles |
+//! | `body.rs`, `shape.rs`, `material.rs`, `surface.rs`, `texture.rs`, `light.rs`, `shadow.rs` | parts, primitives, surfaces |
+//! | `view.rs`, `raycast.rs` | a camera and its rays; from a scene to pixels |
 //! | `math.rs` | functions and random numbers with the same bits on every CPU |
 //!
 //! Everything is a function of the seed and the options alone: no platform mathematics, no clocks, and
@@ -32,6 +34,7 @@ mod body;
 mod buildings;
 mod camera_motion;
 mod clip;
+mod facade;
 mod frontage;
 mod furniture;
 mod ground;
@@ -39,7 +42,9 @@ mod light;
 mod material;
 mod math;
 mod motion;
+mod paint;
 mod people;
+mod plan;
 mod raycast;
 mod scene;
 mod shadow;
@@ -47,13 +52,17 @@ mod shape;
 mod sky;
 mod stream;
 mod street;
+mod style;
+mod surface;
 mod texture;
 mod traffic;
 mod vegetation;
 mod vehicles;
+mod view;
 
 pub use clip::write_clip;
 pub use raycast::{FAR, ID_GROUND, ID_SKY};
 pub use scene::SceneSpec;
 pub use stream::{HEADER, MAGIC, stream};
-pub use street::{DYNAMIC, Frame, Options, Split, Street, Style};
+pub use street::{DYNAMIC, Frame, Options, Split, Street};
+pub use style::Style;

@@ -1,58 +1,12 @@
-//! Surface appearance: from a point in part coordinates to albedo, own light and mirror share.
+//! [`Skin`]: the material of a part, and what it looks like at a point.
 
-use crate::buildings::Facade;
+use crate::facade::Facade;
 use crate::light::Light;
 use crate::math::{clamp01, floor, fract, hash2, unit};
-use crate::texture::{band, fade, fbm2, fbm3, mix, octaves, pulses, step};
-use crate::vehicles::Paint;
+use crate::paint::Paint;
+use crate::surface::{Look, Spot};
+use crate::texture::{band, fade, fbm2, fbm3, masonry, mix, octaves, pulses, step};
 use glam::Vec3;
-
-/// A point to shade, in part coordinates: textures stick to the part and move with it.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Spot {
-    /// Surface point, metres.
-    pub(crate) p: Vec3,
-    /// Outward unit normal.
-    pub(crate) n: Vec3,
-    /// Footprint of a pixel along each axis, metres.
-    pub(crate) fp: Vec3,
-    /// Texture seed of the object.
-    pub(crate) seed: u32,
-}
-
-impl Spot {
-    /// Largest footprint.
-    pub(crate) fn width(&self) -> f32 {
-        self.fp.x.max(self.fp.y).max(self.fp.z)
-    }
-}
-
-/// What a surface sends back.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Look {
-    /// Diffuse reflectance, linear.
-    pub(crate) albedo: Vec3,
-    /// Own light, linear.
-    pub(crate) glow: Vec3,
-    /// Share of the mirrored sky, 0..1.
-    pub(crate) mirror: f32,
-}
-
-impl Look {
-    /// A matt surface.
-    pub(crate) fn matt(albedo: Vec3) -> Look {
-        Look { albedo, glow: Vec3::ZERO, mirror: 0.0 }
-    }
-
-    /// Blend of two surfaces.
-    pub(crate) fn mix(self, other: Look, t: f32) -> Look {
-        Look {
-            albedo: mix(self.albedo, other.albedo, t),
-            glow: mix(self.glow, other.glow, t),
-            mirror: self.mirror + (other.mirror - self.mirror) * t,
-        }
-    }
-}
 
 /// Kinds of sign face.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -172,16 +126,6 @@ fn tiles(at: &Spot, rgb: Vec3) -> Look {
     let shade = 1.0 + 0.35 * tone * fade(0.3, fu.max(fv)) - 0.35 * edge
         + 0.3 * fbm2(u, v, octaves(2.2, 3, at.seed ^ 1), fu.max(fv));
     Look::matt(rgb * shade)
-}
-
-/// Masonry: courses with offset joints and a tone per block.
-pub(crate) fn masonry(u: f32, z: f32, fu: f32, fz: f32, size: f32, seed: u32) -> f32 {
-    let row = floor(z / size);
-    let long = 2.2 * size;
-    let shifted = u + if row as i32 & 1 == 0 { 0.0 } else { 0.5 * long };
-    let tone = unit(hash2(floor(shifted / long) as i32, row as i32, seed)) - 0.5;
-    let joint = pulses(z, size, 0.0, 0.13 * size, fz).max(pulses(shifted, long, 0.0, 0.11 * size, fu));
-    1.0 + 0.34 * tone * fade(1.4 * size, fu.max(fz)) + 0.20 * joint
 }
 
 fn blocks(at: &Spot, rgb: Vec3, size: f32) -> Look {

@@ -13,18 +13,14 @@
 use crate::body::{Body, Part};
 use crate::ground::Ground;
 use crate::light::Light;
-use crate::material::{Look, Spot};
 use crate::motion::Motion;
 use crate::shadow;
 use crate::shape::Rays;
 use crate::sky::sky;
-use glam::{BVec4A, DMat3, DVec3, Vec2, Vec3, Vec4};
+use crate::surface::{Look, Spot};
+use crate::view::{Grid, Rect, View};
+use glam::{BVec4A, DMat3, DVec3, Vec3, Vec4};
 
-/// Offsets of a pixel's four rays from its centre, pixels: the centre and three at 120 degrees.
-/// Mirrored on odd columns and rows so that no direction is preferred.
-const JITTER: [[f32; 2]; 4] = [[0.0, 0.0], [0.093, 0.348], [-0.348, -0.093], [0.255, -0.255]];
-/// Nearest depth drawn, metres.
-const NEAR: f32 = 0.08;
 /// Farthest surface with a depth, metres; beyond it the ground fades into the sky.
 pub const FAR: f32 = 150.0;
 /// Object number of no surface.
@@ -47,23 +43,6 @@ pub(crate) struct Scene {
     pub(crate) light: Light,
     /// Objects; body `i` has object number `i + 2`.
     pub(crate) bodies: Vec<Body>,
-}
-
-/// Camera of one frame, street axes.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct View {
-    /// Image width.
-    pub(crate) width: usize,
-    /// Image height.
-    pub(crate) height: usize,
-    /// Focal lengths, pixels.
-    pub(crate) focal: [f32; 2],
-    /// Principal point, pixels.
-    pub(crate) centre: [f32; 2],
-    /// Camera (x right, y down, z forward) to street.
-    pub(crate) r: DMat3,
-    /// Camera centre, street.
-    pub(crate) t: DVec3,
 }
 
 /// Pixels of a frame, row by row.
@@ -101,72 +80,6 @@ impl Placed<'_> {
     }
 }
 
-/// Pixel rectangle, end exclusive.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Rect {
-    pub(crate) x0: usize,
-    pub(crate) x1: usize,
-    pub(crate) y0: usize,
-    pub(crate) y1: usize,
-}
-
-/// Ray coordinates of the sample grid.
-pub(crate) struct Grid {
-    /// (u - cx) / fx of the four rays, per column.
-    pub(crate) x: Vec<Vec4>,
-    /// (v - cy) / fy of the four rays, per row.
-    pub(crate) y: Vec<Vec4>,
-}
-
-impl View {
-    fn grid(&self) -> Grid {
-        let line = |n: usize, axis: usize| {
-            (0..n)
-                .map(|i| {
-                    let mirror = if i & 1 == 1 { -1.0 } else { 1.0 };
-                    let ray = |k: usize| i as f32 + 0.5 + mirror * JITTER[k][axis];
-                    (Vec4::new(ray(0), ray(1), ray(2), ray(3)) - self.centre[axis]) / self.focal[axis]
-                })
-                .collect()
-        };
-        Grid { x: line(self.width, 0), y: line(self.height, 1) }
-    }
-
-    /// Screen rectangle of the convex hull of points in camera axes, and its nearest depth; `None` if it
-    /// is behind the camera, off the screen or too small to matter.
-    pub(crate) fn rect_of(&self, points: &[Vec3; 8], smallest: f32) -> Option<(Rect, f32)> {
-        let (mut lo, mut hi) = (Vec2::splat(f32::INFINITY), Vec2::splat(f32::NEG_INFINITY));
-        let mut near = f32::INFINITY;
-        let mut grow = |p: Vec3| {
-            let q = Vec2::new(p.x / p.z * self.focal[0] + self.centre[0], p.y / p.z * self.focal[1] + self.centre[1]);
-            lo = lo.min(q);
-            hi = hi.max(q);
-        };
-        for &p in points {
-            near = near.min(p.z);
-            if p.z >= NEAR {
-                grow(p);
-                // Every segment to a point behind the near plane stays inside the hull.
-                for &b in points.iter().filter(|b| b.z < NEAR) {
-                    grow(p + (b - p) * ((p.z - NEAR) / (p.z - b.z)));
-                }
-            }
-        }
-        let visible = lo.x < hi.x && hi.x > 0.0 && hi.y > 0.0;
-        if !visible || lo.x >= self.width as f32 || lo.y >= self.height as f32 {
-            return None;
-        }
-        if hi.x - lo.x < smallest && hi.y - lo.y < smallest {
-            return None;
-        }
-        // A ray may start half a pixel from its centre.
-        let start = |v: f32| if v > 1.0 { (v - 1.0) as usize } else { 0 };
-        let end = |v: f32, n: usize| if v + 1.0 < n as f32 { (v + 2.0) as usize } else { n }.min(n);
-        let rect = Rect { x0: start(lo.x), x1: end(hi.x, self.width), y0: start(lo.y), y1: end(hi.y, self.height) };
-        Some((rect, near))
-    }
-}
-
 /// Draws a scene at a time.
 pub(crate) fn render(scene: &Scene, view: &View, time: f64) -> Raster {
     let grid = view.grid();
@@ -178,7 +91,9 @@ pub(crate) fn render(scene: &Scene, view: &View, time: f64) -> Raster {
     }
     let ground = camera_rays(view);
     target.draw_ground(scene, &ground, &grid, view);
-    let dark = shadow::ground_light(scene, view, &grid, time, |i| (&target.depth[i], &target.part[i], GROUND));
+    let dark = shadow::ground_light((&scene.bodies, &scene.light), view, &grid, time, |i| {
+        (&target.depth[i], &target.part[i], GROUND)
+    });
     shade(&Shading { scene, view, grid: &grid, placed: &placed, ground: &ground, dark: &dark }, &target)
 }
 

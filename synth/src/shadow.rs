@@ -3,10 +3,10 @@
 //! Each caster covers a screen rectangle (its base and where the sun throws its top); rays of the ground
 //! inside are tested against the caster in its own axes.
 
-use crate::body::Shadow;
-use crate::light::Weather;
+use crate::body::{Body, Shadow};
+use crate::light::{Light, Weather};
 use crate::math::clamp01;
-use crate::raycast::{Grid, Rect, Scene, View};
+use crate::view::{Grid, Rect, View};
 use glam::{DVec3, Vec3, Vec4};
 
 /// Light of a ground ray: share of open sky, and whether the sun reaches it.
@@ -32,7 +32,7 @@ struct Caster {
 
 /// Light of every ground ray. `surface` gives depths, parts and the number of the ground.
 pub(crate) fn ground_light<'a>(
-    scene: &Scene,
+    (bodies, light): (&[Body], &Light),
     view: &View,
     grid: &Grid,
     time: f64,
@@ -40,8 +40,8 @@ pub(crate) fn ground_light<'a>(
 ) -> Vec<Vec4> {
     let mut out = vec![Vec4::ONE; view.width * view.height];
     let mut nodes = Vec::new();
-    let sunny = scene.light.weather == Weather::Sunny;
-    for body in &scene.bodies {
+    let sunny = light.weather == Weather::Sunny;
+    for body in bodies {
         let caster = match body.shadow {
             Shadow::None => continue,
             Shadow::Box { half, from, to, contact } => Caster { half, from, to, contact, ball: false },
@@ -56,7 +56,7 @@ pub(crate) fn ground_light<'a>(
         let node = nodes[0];
         let (ax, ay) = (node.r.x_axis.as_vec3(), node.r.y_axis.as_vec3());
         let base = Vec3::new(node.t.x as f32, node.t.y as f32, 0.0);
-        let sun = scene.light.sun;
+        let sun = light.sun;
         // Contact reaches REACH beyond the base.
         let margin = if caster.contact > 0.0 { REACH } else { 0.0 };
         let throw = if sunny { -sun * (caster.to / sun.z) } else { Vec3::ZERO };

@@ -140,6 +140,16 @@ pub(crate) fn mix(a: Vec3, b: Vec3, t: f32) -> Vec3 {
     a + (b - a) * t
 }
 
+/// Masonry: courses with offset joints and a tone per block.
+pub(crate) fn masonry(u: f32, z: f32, fu: f32, fz: f32, size: f32, seed: u32) -> f32 {
+    let row = floor(z / size);
+    let long = 2.2 * size;
+    let shifted = u + if row as i32 & 1 == 0 { 0.0 } else { 0.5 * long };
+    let tone = unit(hash2(floor(shifted / long) as i32, row as i32, seed)) - 0.5;
+    let joint = pulses(z, size, 0.0, 0.13 * size, fz).max(pulses(shifted, long, 0.0, 0.11 * size, fu));
+    1.0 + 0.34 * tone * fade(1.4 * size, fu.max(fz)) + 0.20 * joint
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

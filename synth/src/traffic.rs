@@ -9,7 +9,7 @@ use crate::ground::{Cross, Direction};
 use crate::math::Rng;
 use crate::motion::{Arc, Path, Speed, follow};
 use crate::people::{cyclist, pedestrian};
-use crate::scene::Plan;
+use crate::plan::Plan;
 use crate::vehicles::Model;
 use glam::{DVec2, DVec3};
 
