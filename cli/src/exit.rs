@@ -15,6 +15,7 @@
 //! | 130 | Ctrl-C |
 
 use clap::error::{ContextKind, ErrorKind};
+use sf_formats::error::one_line;
 use sf_formats::{Error, Result};
 use std::panic::{self, AssertUnwindSafe};
 use std::process::ExitCode;
@@ -55,16 +56,7 @@ pub(crate) fn code(result: &Result<()>) -> ExitCode {
 
 /// `error: ` and the message, one line, at most 300 bytes.
 fn error_line(e: &Error) -> String {
-    let mut line = format!("error: {}", e.line());
-    if line.len() > 300 {
-        let mut end = 297;
-        while !line.is_char_boundary(end) {
-            end -= 1;
-        }
-        line.truncate(end);
-        line.push_str("...");
-    }
-    line
+    one_line(&format!("error: {e}"))
 }
 
 /// What the argument parser answered instead of arguments.

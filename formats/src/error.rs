@@ -152,19 +152,24 @@ impl Error {
         }
     }
 
-    /// The message as one line of at most 300 bytes, as the command line prints it.
+    /// The message as one line of at most 300 bytes.
     pub fn line(&self) -> String {
-        let mut line: String = self.to_string().chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
-        if line.len() > 300 {
-            let mut end = 297;
-            while !line.is_char_boundary(end) {
-                end -= 1;
-            }
-            line.truncate(end);
-            line.push_str("...");
-        }
-        line
+        one_line(&self.to_string())
     }
+}
+
+/// A text as one line of at most 300 bytes: control characters become spaces, what is longer ends in `...`.
+pub fn one_line(text: &str) -> String {
+    let mut line: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    if line.len() > 300 {
+        let mut end = 297;
+        while !line.is_char_boundary(end) {
+            end -= 1;
+        }
+        line.truncate(end);
+        line.push_str("...");
+    }
+    line
 }
 
 /// Untrusted bytes as printable ASCII, at most 80 characters.
