@@ -6,8 +6,10 @@
 //! | `output.rs` | results, remarks, output folders that appear whole |
 //! | `progress.rs` | progress bars, on a terminal only |
 //! | `exit.rs` | one-line errors, exit codes, caught panics |
-//! | `network.rs` | presets, configuration files, the model that `run` takes |
+//! | `network.rs` | presets, configuration files, checkpoints with a progress bar |
+//! | `model.rs` | the model of a verb: blob, checkpoint, or random weights |
 //! | `reconstruct.rs` | clip and model to network output |
+//! | `results.rs` | network output to files |
 //! | `views.rs` | cameras for `render`: along the clip, fixed, in orbit, displaced |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
@@ -15,10 +17,12 @@
 
 mod args;
 mod exit;
+mod model;
 mod network;
 mod output;
 mod progress;
 mod reconstruct;
+mod results;
 mod signals;
 mod verbs;
 mod views;

@@ -1,4 +1,4 @@
-//! Which network: presets and configuration files for `init` and `convert`, the model for `run`.
+//! Which network: presets and configuration files for `init` and `convert`; checkpoints with a progress bar.
 
 use crate::progress::Progress;
 use clap::ValueEnum;

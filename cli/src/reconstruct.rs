@@ -1,117 +1,27 @@
 //! Clip and model to network output: what `run`, `eval` and `demo` share.
 
-use crate::args::{EngineArgs, Precision, Size};
-use crate::network;
-use crate::output::Console;
-use crate::signals;
+use crate::args::{EngineArgs, Size};
+use crate::model::Loaded;
 use serde_json::{Value, json};
-use sf_formats::blob::{Blob, LoadMode, Verify};
+use sf_eval::Protocol;
 use sf_formats::clip::Clip;
-use sf_formats::digest::{Digest, hex, sha256};
-use sf_formats::error::escape_path;
-use sf_formats::sniff::FileKind;
-use sf_formats::{Error, Intrinsics, ModelConfig, Result, checkpoint};
-use sf_quant::{Options as ConvertOptions, Outputs, Seeded, convert, convert_to_bytes};
-use std::path::{Path, PathBuf};
+use sf_formats::digest::{Digest, sha256};
+use sf_formats::{Intrinsics, ModelConfig, Result};
 use std::sync::Arc;
-use std::time::Instant;
 use streetforward::preprocess::{DEFAULT_PIXELS, fit_size, prepare};
-use streetforward::{ClipShape, FrameSource, Model, Options, Output, Prepared, Session, SourceFrame};
+use streetforward::{ClipShape, FrameSource, Options, Output, Prepared, Session, SourceFrame};
 
-/// Seed of the network that stands in where no model is given.
-const RANDOM_SEED: u64 = 1;
-
-/// A model and where it came from.
-pub(crate) struct Loaded {
-    /// The model.
-    pub(crate) model: Arc<Model>,
-    /// File, or none for the random network.
-    path: Option<PathBuf>,
-    /// Milliseconds to open, convert and verify.
-    load_ms: f64,
-}
-
-impl Loaded {
-    /// For reports.
-    pub(crate) fn json(&self) -> Value {
-        json!({
-            "path": self.path.as_ref().map(|p| p.to_string_lossy().into_owned()),
-            "random_weights": self.path.is_none(),
-            "digest": hex(self.model.blob().digest()),
-            "parameters": self.model.parameters(),
-            "weights_bytes": self.model.blob().file_bytes(),
-            "load_ms": self.load_ms,
-        })
-    }
-}
-
-/// Opens a blob; converts a checkpoint into a temporary blob first; without a path makes the random nano
-/// network in memory and says so.
-pub(crate) fn load(path: Option<&Path>, engine: &EngineArgs, to: Precision, console: &Console) -> Result<Loaded> {
-    let start = Instant::now();
-    let blob = match path {
-        None => {
-            console.warn("no model given: a nano network with random weights runs, its result is noise");
-            let seeded = Seeded::new(&ModelConfig::nano(), RANDOM_SEED, Outputs::Random)?;
-            Blob::from_bytes(&convert_to_bytes(&seeded, &ConvertOptions::to(to.dtype()))?)?
-        }
-        Some(path) if is_checkpoint(path)? => from_checkpoint(path, to, console)?,
-        Some(path) => Blob::open(path, engine.load.mode(), Verify::Digests)?,
-    };
-    let model = Arc::new(Model::from_blob(blob)?);
-    Ok(Loaded { model, path: path.map(Path::to_path_buf), load_ms: start.elapsed().as_secs_f64() * 1e3 })
-}
-
-/// Whether a path holds a checkpoint; everything else is left to the blob reader and its messages.
-fn is_checkpoint(path: &Path) -> Result<bool> {
-    let meta = std::fs::metadata(path).map_err(|e| Error::io(path, "open", &e))?;
-    if !meta.is_file() {
-        return Ok(meta.is_dir());
-    }
-    let kinds = [FileKind::Safetensors, FileKind::Zip, FileKind::Pickle, FileKind::Tar, FileKind::Json];
-    Ok(kinds.contains(&FileKind::of_file(path)?))
-}
-
-/// Converts a checkpoint into a temporary file that is gone when the blob is open.
-fn from_checkpoint(path: &Path, to: Precision, console: &Console) -> Result<Blob> {
-    let shown = escape_path(path);
-    console.note(format!("{shown} is a checkpoint: converting it to {} for this run", to.dtype().name()));
-    let source = checkpoint::open(&[path.to_path_buf()])?;
-    let folder = scratch_folder()?;
-    let file = folder.0.join("model.sfw");
-    let progress = console.progress(source.tensors().len() as u64, "convert");
-    let watched = network::Watched::new(&*source, &progress);
-    convert(&watched, &file, sf_formats::atomic::Overwrite::No, &ConvertOptions::to(to.dtype()))?;
-    drop(progress);
-    // The mapping keeps the unlinked file; nobody else can reach it any more.
-    Blob::open(&file, LoadMode::Map, Verify::Structure)
-}
-
-/// A private temporary folder, deleted when dropped.
-struct Scratch(PathBuf);
-
-fn scratch_folder() -> Result<Scratch> {
-    use std::os::unix::fs::DirBuilderExt;
-    let pid = std::process::id();
-    // The name need not be secret: making the folder fails when somebody else made it first.
-    for attempt in 0..100 {
-        let path = std::env::temp_dir().join(format!("streetforward.{pid}.{attempt}"));
-        match std::fs::DirBuilder::new().mode(0o700).create(&path) {
-            Ok(()) => {
-                signals::guard_stage(&path);
-                return Ok(Scratch(path));
-            }
-            Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
-            Err(e) => return Err(Error::io(&path, "create", &e)),
-        }
-    }
-    Err(Error::resource("temporary folder", "a hundred names are taken: clean the system's temporary folder"))
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-        signals::release_stage(&self.0);
+/// The frames that the protocol gives to the model.
+pub(crate) fn context_clip(clip: &Clip, protocol: &Protocol) -> Clip {
+    let pick = |i: &usize| clip.frames[*i].clone();
+    Clip {
+        frames: protocol.context.iter().map(pick).collect(),
+        indices: protocol.context.iter().map(|&i| clip.indices[i]).collect(),
+        total: clip.total,
+        intrinsics: clip.intrinsics,
+        poses: clip.poses.as_ref().map(|p| protocol.context.iter().map(|&i| p[i]).collect()),
+        folder: clip.folder.clone(),
+        notes: Vec::new(),
     }
 }
 

@@ -1,8 +1,10 @@
-//! Which camera sees the scene at which time: the views that `render` draws.
+//! Which camera sees the scene at which time: the views that `render` and `demo` draw.
 
 use crate::args::{Shift, Size};
 use sf_formats::camera_json::TimedCamera;
+use sf_formats::image_io::Rgb8;
 use sf_formats::{Camera, Error, Pose, Result, Scene};
+use sf_splat::Rendered;
 
 /// Where the cameras of a list of times come from.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -115,6 +117,12 @@ pub(crate) fn sized(camera: &Camera, size: Size) -> Result<Camera> {
     out.k.cy = f64::from(h) / 2.0 + (k.cy - f64::from(camera.height) / 2.0) * scale;
     out.check("--size")?;
     Ok(out)
+}
+
+/// The colours of a drawn view as bytes.
+pub(crate) fn rgb8(drawn: &Rendered) -> Rgb8 {
+    let data = drawn.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    Rgb8::new(drawn.width as u32, drawn.height as u32, data)
 }
 
 #[cfg(test)]

@@ -16,11 +16,10 @@
 //! ```
 
 use crate::args::{EngineArgs, FolderArgs, Precision, Shift, path_json};
+use crate::model;
 use crate::output::{Console, OutputFolder, files_json, human_count, json_text};
 use crate::reconstruct;
-use crate::verbs::eval::context_clip;
-use crate::verbs::render::rgb8;
-use crate::verbs::run::{self, Results};
+use crate::results::Results;
 use crate::views::{self, Rig};
 use serde_json::json;
 use sf_eval::{EvalClip, EvalOptions, Protocol, evaluate};
@@ -62,10 +61,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let clip = Clip::open(&clip_folder, &ClipOptions::default())?;
     let truth = GroundTruth::load(&clip_folder, &clip.indices)?;
 
-    let loaded = reconstruct::load(args.model.as_deref(), &args.engine, Precision::F32, console)?;
+    let loaded = model::load(args.model.as_deref(), &args.engine, Precision::F32, console)?;
     let config = loaded.model.config();
     let protocol = Protocol::storm20(clip.total)?;
-    let context = context_clip(&clip, &protocol);
+    let context = reconstruct::context_clip(&clip, &protocol);
     let size = reconstruct::network_size(config, &context, None);
     let prepared = reconstruct::prepare_clip(config, &context, None, size)?;
     let mut session = reconstruct::session(&loaded, prepared.shape, &args.engine)?;
@@ -79,7 +78,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
 
     let out = session.output();
     let mut scene = out.to_scene(config, &reconstruct::sources(&context));
-    scene.notes = run::notes(&loaded, &PathBuf::from(format!("synthetic street {seed}")));
+    scene.notes = loaded.notes(&PathBuf::from(format!("synthetic street {seed}")));
     scene.save(&folder.subfolder("scene")?, Overwrite::Yes)?;
     let known: Vec<TruthFrame> = match &truth {
         Some(t) => protocol.context.iter().map(|&i| t.frames[i].clone()).collect(),
@@ -168,7 +167,7 @@ impl Album<'_> {
             let drawn = self.renderer.render(&now, &view.camera, &self.scene.splat, &RenderOptions::default())?;
             self.total_ms += start.elapsed().as_secs_f64() * 1e3;
             self.pictures += 1;
-            image_io::write_png(&folder.join(format!("{i:06}.png")), &rgb8(&drawn), Overwrite::Yes)?;
+            image_io::write_png(&folder.join(format!("{i:06}.png")), &views::rgb8(&drawn), Overwrite::Yes)?;
         }
         Ok(())
     }

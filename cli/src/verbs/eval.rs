@@ -1,8 +1,9 @@
 //! `eval`: a model against clips with ground truth, beside the trivial alternatives.
 
 use crate::args::{EngineArgs, Precision, Size, path_json};
+use crate::model::{self, Loaded};
 use crate::output::Console;
-use crate::reconstruct::{self, Loaded};
+use crate::reconstruct;
 use clap::ValueEnum;
 use serde_json::{Value, json};
 use sf_eval::{EvalClip, EvalOptions, EvalReport, Protocol, TargetPoses, evaluate};
@@ -55,7 +56,7 @@ enum Poses {
 
 /// Evaluates and reports.
 pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
-    let loaded = reconstruct::load(args.model.as_deref(), &args.engine, args.precision, console)?;
+    let loaded = model::load(args.model.as_deref(), &args.engine, args.precision, console)?;
     let mut renderer = Renderer::new(crate::args::threads(args.engine.threads))?;
     let mut total: Option<EvalReport> = None;
     let mut clips = Vec::new();
@@ -95,7 +96,7 @@ fn judge(path: &Path, loaded: &Loaded, args: &Args, renderer: &mut Renderer) -> 
 /// The scene of a clip's context frames.
 fn context_scene(clip: &Clip, protocol: &Protocol, loaded: &Loaded, args: &Args) -> Result<(Scene, f64)> {
     let config = loaded.model.config();
-    let context = context_clip(clip, protocol);
+    let context = reconstruct::context_clip(clip, protocol);
     let size = reconstruct::network_size(config, &context, args.size);
     let prepared = reconstruct::prepare_clip(config, &context, None, size)?;
     let mut session = reconstruct::session(loaded, prepared.shape, &args.engine)?;
@@ -104,18 +105,4 @@ fn context_scene(clip: &Clip, protocol: &Protocol, loaded: &Loaded, args: &Args)
     let run_ms = start.elapsed().as_secs_f64() * 1e3;
     loaded.model.blob().unchanged()?;
     Ok((session.output().to_scene(config, &reconstruct::sources(&context)), run_ms))
-}
-
-/// The frames that the protocol gives to the model.
-pub(crate) fn context_clip(clip: &Clip, protocol: &Protocol) -> Clip {
-    let pick = |i: &usize| clip.frames[*i].clone();
-    Clip {
-        frames: protocol.context.iter().map(pick).collect(),
-        indices: protocol.context.iter().map(|&i| clip.indices[i]).collect(),
-        total: clip.total,
-        intrinsics: clip.intrinsics,
-        poses: clip.poses.as_ref().map(|p| protocol.context.iter().map(|&i| p[i]).collect()),
-        folder: clip.folder.clone(),
-        notes: Vec::new(),
-    }
 }

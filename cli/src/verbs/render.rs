@@ -17,7 +17,7 @@ use sf_formats::atomic::Overwrite;
 use sf_formats::camera_json::{self, TimedCamera};
 use sf_formats::config::{SelfRule, Split};
 use sf_formats::error::escape_path;
-use sf_formats::image_io::{self, Rgb8};
+use sf_formats::image_io;
 use sf_formats::picture::{self, DepthScale};
 use sf_formats::{Error, Result, Scene, npy};
 use sf_splat::{Extra, RenderOptions, Rendered, Renderer};
@@ -234,7 +234,7 @@ impl<'a> Painter<'a> {
         for buffer in &args.buffers {
             match buffer {
                 Buffer::Rgb => {
-                    let image = rgb8(drawn);
+                    let image = views::rgb8(drawn);
                     match args.format {
                         Picture::Png => image_io::write_png(&file("rgb", "png")?, &image, Overwrite::Yes)?,
                         Picture::Jpg => image_io::write_jpeg(&file("rgb", "jpg")?, &image, 92, Overwrite::Yes)?,
@@ -261,12 +261,6 @@ impl<'a> Painter<'a> {
         }
         Ok(())
     }
-}
-
-/// The colours as bytes.
-pub(crate) fn rgb8(drawn: &Rendered) -> Rgb8 {
-    let data = drawn.rgb.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    Rgb8::new(drawn.width as u32, drawn.height as u32, data)
 }
 
 /// Velocity of each Gaussian as the composition moves it: the mean of both directions, none for static

@@ -1,0 +1,125 @@
+//! [`Loaded`]: the model of a verb: a blob, a checkpoint converted for this run, or random weights.
+
+use crate::args::{EngineArgs, Precision};
+use crate::network::Watched;
+use crate::output::Console;
+use crate::signals;
+use serde_json::{Value, json};
+use sf_formats::atomic::Overwrite;
+use sf_formats::blob::{Blob, LoadMode, Verify};
+use sf_formats::digest::hex;
+use sf_formats::error::escape_path;
+use sf_formats::sniff::FileKind;
+use sf_formats::{Error, ModelConfig, Result, checkpoint};
+use sf_quant::{Options, Outputs, Seeded, convert, convert_to_bytes};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+use streetforward::Model;
+
+/// Seed of the network that stands in where no model is given.
+const RANDOM_SEED: u64 = 1;
+
+/// A model and where it came from.
+pub(crate) struct Loaded {
+    /// The model.
+    pub(crate) model: Arc<Model>,
+    /// File, or none for the random network.
+    path: Option<PathBuf>,
+    /// Milliseconds to open, convert and verify.
+    load_ms: f64,
+}
+
+impl Loaded {
+    /// For reports.
+    pub(crate) fn json(&self) -> Value {
+        json!({
+            "path": self.path.as_ref().map(|p| p.to_string_lossy().into_owned()),
+            "random_weights": self.path.is_none(),
+            "digest": hex(self.model.blob().digest()),
+            "parameters": self.model.parameters(),
+            "weights_bytes": self.model.blob().file_bytes(),
+            "load_ms": self.load_ms,
+        })
+    }
+
+    /// Provenance that stays with a scene.
+    pub(crate) fn notes(&self, clip: &Path) -> Vec<(String, String)> {
+        vec![
+            ("generator".into(), format!("streetforward {}", env!("CARGO_PKG_VERSION"))),
+            ("model_digest".into(), hex(self.model.blob().digest())),
+            ("random_weights".into(), self.path.is_none().to_string()),
+            ("clip".into(), clip.to_string_lossy().into_owned()),
+        ]
+    }
+}
+
+/// Opens a blob; converts a checkpoint into a temporary blob first; without a path makes the random nano
+/// network in memory and says so.
+pub(crate) fn load(path: Option<&Path>, engine: &EngineArgs, to: Precision, console: &Console) -> Result<Loaded> {
+    let start = Instant::now();
+    let blob = match path {
+        None => {
+            console.warn("no model given: a nano network with random weights runs, its result is noise");
+            let seeded = Seeded::new(&ModelConfig::nano(), RANDOM_SEED, Outputs::Random)?;
+            Blob::from_bytes(&convert_to_bytes(&seeded, &Options::to(to.dtype()))?)?
+        }
+        Some(path) if is_checkpoint(path)? => from_checkpoint(path, to, console)?,
+        Some(path) => Blob::open(path, engine.load.mode(), Verify::Digests)?,
+    };
+    let model = Arc::new(Model::from_blob(blob)?);
+    Ok(Loaded { model, path: path.map(Path::to_path_buf), load_ms: start.elapsed().as_secs_f64() * 1e3 })
+}
+
+/// Whether a path holds a checkpoint; everything else is left to the blob reader and its messages.
+fn is_checkpoint(path: &Path) -> Result<bool> {
+    let meta = std::fs::metadata(path).map_err(|e| Error::io(path, "open", &e))?;
+    if !meta.is_file() {
+        return Ok(meta.is_dir());
+    }
+    let kinds = [FileKind::Safetensors, FileKind::Zip, FileKind::Pickle, FileKind::Tar, FileKind::Json];
+    Ok(kinds.contains(&FileKind::of_file(path)?))
+}
+
+/// Converts a checkpoint into a temporary file that is gone when the blob is open.
+fn from_checkpoint(path: &Path, to: Precision, console: &Console) -> Result<Blob> {
+    let shown = escape_path(path);
+    console.note(format!("{shown} is a checkpoint: converting it to {} for this run", to.dtype().name()));
+    let source = checkpoint::open(&[path.to_path_buf()])?;
+    let folder = scratch_folder()?;
+    let file = folder.0.join("model.sfw");
+    let progress = console.progress(source.tensors().len() as u64, "convert");
+    let watched = Watched::new(&*source, &progress);
+    convert(&watched, &file, Overwrite::No, &Options::to(to.dtype()))?;
+    drop(progress);
+    // The mapping keeps the unlinked file; nobody else can reach it any more.
+    Blob::open(&file, LoadMode::Map, Verify::Structure)
+}
+
+/// A private temporary folder, deleted when dropped.
+struct Scratch(PathBuf);
+
+fn scratch_folder() -> Result<Scratch> {
+    use std::os::unix::fs::DirBuilderExt;
+    let pid = std::process::id();
+    // The name need not be secret: making the folder fails when somebody else made it first.
+    for attempt in 0..100 {
+        let path = std::env::temp_dir().join(format!("streetforward.{pid}.{attempt}"));
+        match std::fs::DirBuilder::new().mode(0o700).create(&path) {
+            Ok(()) => {
+                signals::guard_stage(&path);
+                return Ok(Scratch(path));
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(e) => return Err(Error::io(&path, "create", &e)),
+        }
+    }
+    Err(Error::resource("temporary folder", "a hundred names are taken: clean the system's temporary folder"))
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+        signals::release_stage(&self.0);
+    }
+}
