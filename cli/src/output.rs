@@ -2,15 +2,16 @@
 //! error, output folders that appear whole or not at all.
 
 use crate::args::{FolderArgs, path_json};
-use crate::progress::Progress;
+use crate::progress::{Follow, Progress};
 use crate::signals;
 use serde_json::Value;
 use sf_formats::{Error, Result};
 use std::ffi::OsString;
 use std::fmt::Display;
 use std::fs;
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
+use streetforward::Session;
 
 /// Where results and remarks of one command go.
 pub(crate) struct Console {
@@ -44,6 +45,12 @@ impl Console {
     /// A progress bar.
     pub(crate) fn progress(&self, total: u64, what: &'static str) -> Progress {
         Progress::new(total, what, !self.quiet)
+    }
+
+    /// A bar over the layers of the session's next run.
+    pub(crate) fn follow(&self, session: &Session) -> Follow {
+        let visible = !self.quiet && io::stderr().is_terminal();
+        Follow::new(session.layers_done(), session.plan().layers(), "network", visible)
     }
 }
 

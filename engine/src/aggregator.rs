@@ -52,7 +52,7 @@ pub(crate) fn run(
         let global = is_global(config, i);
         let mask = if global { d.global_mask() } else { d.frame_mask(d.tokens) };
         block::forward(net, weights, x, Sight { mask, rope: Some(rope) }, scratch);
-        probe.guard(format_args!("aa.{i}"), x)?;
+        probe.layer(format_args!("aa.{i}"), x)?;
         probe.emit(format_args!("aa.{i}"), None, &[d.frames, d.tokens, dim], x);
         if let Some(slot) = plan.pairs.iter().position(|&p| p == i / 2) {
             let pair = &mut pairs[slot * rows * 2 * dim..][..rows * 2 * dim];

@@ -163,7 +163,7 @@ impl Pass<'_> {
                     block::forward(self.net, block, x, Sight { mask: self.mask, rope: Some(rope) }, scratch);
                 }
             }
-            probe.guard(format_args!("causal.{}.{i}", self.name), x)?;
+            probe.layer(format_args!("causal.{}.{i}", self.name), x)?;
             if let Some(slot) = kept.iter().position(|&t| t == i) {
                 tapped[slot * x.len()..][..x.len()].copy_from_slice(x);
             }

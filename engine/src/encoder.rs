@@ -58,7 +58,7 @@ pub(crate) fn run(net: Net, d: &Dims, tables: &Tables, images: &[u8], to: Encode
     let mask = d.frame_mask(d.encoder_tokens);
     for (i, weights) in w.encoder.iter().enumerate() {
         block::forward(net, weights, x, Sight { mask, rope: None }, scratch);
-        probe.guard(format_args!("encoder.{i}"), x)?;
+        probe.layer(format_args!("encoder.{i}"), x)?;
     }
     for f in 0..d.frames {
         let from = &x[(f * d.encoder_tokens + 1 + registers) * dim..][..d.patches * dim];

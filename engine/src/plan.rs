@@ -16,7 +16,7 @@ use crate::dims::{ClipShape, Dims};
 use crate::gaussians;
 use crate::heads;
 use crate::model::{DenseHead, Model};
-use sf_formats::config::ModelConfig;
+use sf_formats::config::{Head, HeadKind, ModelConfig, MotionLayout};
 use sf_formats::{Error, Result};
 use sf_ops::attention::FrameMask;
 use std::fmt;
@@ -34,6 +34,7 @@ pub struct Plan {
     pub(crate) areas: [usize; 3],
     stages: Vec<(&'static str, usize)>,
     output_values: usize,
+    layers: u32,
     threads: usize,
 }
 
@@ -78,6 +79,7 @@ impl Plan {
             areas,
             stages,
             output_values: n * dims.pixels() * crate::output::values_per_pixel(config),
+            layers: layers(config, n),
             threads,
         };
         let need = plan.arena_bytes() + plan.output_bytes();
@@ -102,6 +104,11 @@ impl Plan {
         ClipShape { frames: self.dims.frames, height: self.dims.height, width: self.dims.width }
     }
 
+    /// Transformer blocks of a run, for progress.
+    pub fn layers(&self) -> u32 {
+        self.layers
+    }
+
     /// Bytes of the arena.
     pub fn arena_bytes(&self) -> u64 {
         4 * carved_len(self.areas) as u64
@@ -111,6 +118,16 @@ impl Plan {
     pub fn output_bytes(&self) -> u64 {
         4 * self.output_values as u64
     }
+}
+
+/// Transformer blocks that a run of `frames` frames goes through; a causal block counts once per pass.
+fn layers(config: &ModelConfig, frames: usize) -> u32 {
+    let head = |h: &Head| if h.kind == HeadKind::XdecLinear { h.depth } else { 0 };
+    let passes = if config.motion_layout == MotionLayout::PerDirection { 2 } else { 1 };
+    let motion =
+        if config.has_motion() && frames > 1 { passes * (config.causal_depth + head(&config.motion)) } else { 0 };
+    let heads = head(&config.depth) + head(&config.conf) + head(&config.gs);
+    config.encoder.depth + config.aa.depth + config.camera_depth + heads + motion
 }
 
 impl fmt::Display for Plan {

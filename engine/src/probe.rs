@@ -1,9 +1,9 @@
-//! What watches a run: stage taps, the cancel flag, the deadline, the guard against broken numbers, and
-//! the stage clock.
+//! What watches a run: stage taps, the cancel flag, the deadline, the guard against broken numbers, the
+//! count of finished layers and the stage clock.
 
 use sf_formats::{Error, Result};
 use std::fmt;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 /// One intermediate result handed to a tap.
@@ -26,11 +26,21 @@ pub type TapFn<'a> = &'a mut dyn FnMut(&Tap);
 pub(crate) const STAGES: [&str; 9] =
     ["preprocess", "encoder", "aa.frame", "aa.global", "camera", "depth", "conf", "gaussians", "motion"];
 
+/// What the outside of a run sees of it, and how it stops it.
+#[derive(Clone, Copy)]
+pub(crate) struct Watch<'a> {
+    /// Set from any thread to stop between two layers.
+    pub(crate) cancel: &'a AtomicBool,
+    /// Transformer blocks finished.
+    pub(crate) layers: &'a AtomicU32,
+    /// When the run stops by itself.
+    pub(crate) deadline: Option<Instant>,
+}
+
 /// Watches one run.
 pub(crate) struct Probe<'a, 't> {
     taps: Option<TapFn<'t>>,
-    cancel: &'a AtomicBool,
-    deadline: Option<Instant>,
+    watch: Watch<'a>,
     clock: Instant,
     /// Time spent per stage of [`STAGES`].
     times: &'a mut [Duration; STAGES.len()],
@@ -40,11 +50,10 @@ impl<'a, 't> Probe<'a, 't> {
     /// Starts the clock; `times` go on from what they hold.
     pub(crate) fn new(
         taps: Option<TapFn<'t>>,
-        cancel: &'a AtomicBool,
-        deadline: Option<Instant>,
+        watch: Watch<'a>,
         times: &'a mut [Duration; STAGES.len()],
     ) -> Probe<'a, 't> {
-        Probe { taps, cancel, deadline, clock: Instant::now(), times }
+        Probe { taps, watch, clock: Instant::now(), times }
     }
 
     /// Whether anybody looks: stages that need extra work to show themselves ask first.
@@ -62,10 +71,10 @@ impl<'a, 't> Probe<'a, 't> {
 
     /// Between layers: stops when cancelled or late, and when `data` holds a NaN or an infinity.
     pub(crate) fn guard(&self, stage: fmt::Arguments, data: &[f32]) -> Result<()> {
-        if self.cancel.load(Ordering::Relaxed) {
+        if self.watch.cancel.load(Ordering::Relaxed) {
             return Err(Error::Deadline(format!("cancelled after {stage}")));
         }
-        if let Some(deadline) = self.deadline
+        if let Some(deadline) = self.watch.deadline
             && Instant::now() > deadline
         {
             return Err(Error::Deadline(format!("deadline passed after {stage}")));
@@ -78,6 +87,12 @@ impl<'a, 't> Probe<'a, 't> {
             ));
         }
         Ok(())
+    }
+
+    /// [`Probe::guard`] after a transformer block, which is counted.
+    pub(crate) fn layer(&self, stage: fmt::Arguments, data: &[f32]) -> Result<()> {
+        self.watch.layers.fetch_add(1, Ordering::Relaxed);
+        self.guard(stage, data)
     }
 
     /// Books the time since the last call on a stage of [`STAGES`].
@@ -117,8 +132,9 @@ mod tests {
 
     #[test]
     fn cancelled_and_late_runs_stop() {
-        let (cancel, mut times) = (AtomicBool::new(false), Default::default());
-        let probe = Probe::new(None, &cancel, None, &mut times);
+        let (cancel, layers, mut times) = (AtomicBool::new(false), AtomicU32::new(0), Default::default());
+        let watch = Watch { cancel: &cancel, layers: &layers, deadline: None };
+        let probe = Probe::new(None, watch, &mut times);
         probe.guard(format_args!("aa.1"), &[1.0]).unwrap();
         let e = probe.guard(format_args!("aa.1"), &[f32::NAN, 0.0]).unwrap_err();
         assert_eq!(e.status() as i32, 9);
@@ -126,7 +142,8 @@ mod tests {
         cancel.store(true, Ordering::Relaxed);
         assert_eq!(probe.guard(format_args!("aa.1"), &[]).unwrap_err().status() as i32, 8);
         cancel.store(false, Ordering::Relaxed);
-        let late = Probe::new(None, &cancel, Some(Instant::now() - Duration::from_secs(1)), &mut times);
+        let deadline = Some(Instant::now() - Duration::from_secs(1));
+        let late = Probe::new(None, Watch { deadline, ..watch }, &mut times);
         assert_eq!(late.guard(format_args!("aa.1"), &[]).unwrap_err().status() as i32, 8);
     }
 }

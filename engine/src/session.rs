@@ -11,13 +11,13 @@ use crate::input::Input;
 use crate::model::Model;
 use crate::output::Output;
 use crate::plan::{DEFAULT_MAX_BYTES, Plan};
-use crate::probe::{Probe, STAGES, TapFn};
+use crate::probe::{Probe, STAGES, TapFn, Watch};
 use crate::tables::Tables;
 use sf_formats::{Error, Intrinsics, Result};
 use sf_ops::cpu::{Ctx, DefaultFloatMode, Isa, Kernels};
 use sf_ops::par::Pool;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 /// Most threads of a session.
@@ -62,6 +62,7 @@ pub struct Session {
     complete: bool,
     window: Option<Window>,
     cancel: Arc<AtomicBool>,
+    layers: Arc<AtomicU32>,
     times: [Duration; STAGES.len()],
 }
 
@@ -139,6 +140,7 @@ impl Session {
             complete: false,
             window: None,
             cancel,
+            layers: Arc::new(AtomicU32::new(0)),
             times: Default::default(),
         })
     }
@@ -167,6 +169,11 @@ impl Session {
     /// status 8. It stays set until cleared.
     pub fn cancel_flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.cancel)
+    }
+
+    /// Transformer blocks that the run in progress has finished, of [`Plan::layers`]; readable from any thread.
+    pub fn layers_done(&self) -> Arc<AtomicU32> {
+        Arc::clone(&self.layers)
     }
 
     /// Wall time of every stage in the last run.
@@ -198,6 +205,7 @@ impl Session {
         self.model.blob().unchanged()?;
         let _mode = DefaultFloatMode::enter();
         self.times = Default::default();
+        self.layers.store(0, Ordering::Relaxed);
         self.forward(input, None, deadline, taps)?;
         Ok(&self.memory.output)
     }
@@ -212,7 +220,8 @@ impl Session {
         let [pairs, motion, work] = carve(self.arena.all(), self.plan.areas);
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
-        let mut probe = Probe::new(taps, &self.cancel, deadline, &mut self.times);
+        let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline };
+        let mut probe = Probe::new(taps, watch, &mut self.times);
         self.complete = false;
         forward.run(Areas { pairs, motion, work }, encoded, &mut self.memory, &mut probe)?;
         self.complete = true;
@@ -239,6 +248,7 @@ impl Session {
         self.model.blob().unchanged()?;
         let _mode = DefaultFloatMode::enter();
         self.times = Default::default();
+        self.layers.store(0, Ordering::Relaxed);
         let per_frame = self.plan.dims.tokens * self.model.config().aa.dim as usize;
         let mut window = match self.window.take() {
             Some(window) => window,
@@ -269,7 +279,8 @@ impl Session {
     fn encode(&mut self, image: &[u8], window: &mut Window) -> Result<()> {
         let [_, _, work] = carve(self.arena.all(), self.plan.areas);
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
-        let mut probe = Probe::new(None, &self.cancel, None, &mut self.times);
+        let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline: None };
+        let mut probe = Probe::new(None, watch, &mut self.times);
         forward::encode_frame(net, &self.plan, &self.tables, image, (work, &mut window.newest), &mut probe)
     }
 

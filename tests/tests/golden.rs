@@ -16,6 +16,7 @@ use sf_quant::seeded::{Outputs, Seeded};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use streetforward::reference::{self, Stage, Stages};
 use streetforward::{ClipShape, Input, Model, Options, Session};
 
@@ -126,6 +127,7 @@ fn fast_with(model: &Arc<Model>, input: &Input, options: Options) -> BTreeMap<St
         stage.data.extend_from_slice(tap.data);
     };
     session.run_watched(input, None, Some(&mut tap)).unwrap();
+    assert_eq!(session.layers_done().load(Ordering::Relaxed), session.plan().layers(), "progress reaches its end");
     stages
 }
 

@@ -108,6 +108,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         session.threads(),
         session.kernels().isa.name()
     ));
+    let bar = console.follow(&session);
     let start = Instant::now();
     match &stages {
         Some(stages) => run_tapped(&mut session, &prepared, stages)?,
@@ -116,6 +117,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         }
     }
     let run_ms = start.elapsed().as_secs_f64() * 1e3;
+    drop(bar);
     // A blob overwritten while it was used has not been the one that was verified.
     loaded.model.blob().unchanged()?;
     let out = session.output();

@@ -68,7 +68,7 @@ pub(crate) fn run(
     for (j, weights) in decoder.blocks.iter().enumerate() {
         let rope = tables.rope(dim / weights.heads, job.tokens);
         block::forward(net, weights, x, Sight { mask, rope: Some(rope) }, scratch);
-        probe.guard(format_args!("{}.{j}", job.name), x)?;
+        probe.layer(format_args!("{}.{j}", job.name), x)?;
     }
     let width = decoder.linear_out.weight.n;
     net.linear(&decoder.linear_out, Act::None, Mat::new(x, rows, dim), MatMut::new(out, rows, width));
