@@ -33,7 +33,6 @@ unsafe fn sdot<const LANE: usize>(acc: int32x4_t, w: int8x16_t, a: int8x16_t) ->
     // SAFETY: the caller's promise; touches only its operands.
     unsafe {
         std::arch::asm!(
-            ".arch_extension dotprod",
             "sdot {acc:v}.4s, {w:v}.16b, {a:v}.4b[{lane}]",
             acc = inout(vreg) acc,
             w = in(vreg) w,
