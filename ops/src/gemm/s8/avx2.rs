@@ -74,10 +74,10 @@ impl Dot8 for Avx2 {
     }
 
     #[inline(always)]
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> Self::A {
+    fn prep_a(self, quad: &[i8; QUAD]) -> Self::A {
         // SAFETY: the token proves avx2.
         unsafe {
-            let a = _mm256_set1_epi32(i32::from_ne_bytes(rows[r].map(|v| v as u8)));
+            let a = _mm256_set1_epi32(i32::from_ne_bytes(quad.map(|v| v as u8)));
             (a, _mm256_abs_epi8(a))
         }
     }

@@ -54,9 +54,9 @@ impl Dot8 for Avx512Vnni {
     }
 
     #[inline(always)]
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> __m512i {
+    fn prep_a(self, quad: &[i8; QUAD]) -> __m512i {
         // SAFETY: the token proves avx512f.
-        unsafe { _mm512_set1_epi32(i32::from_ne_bytes(rows[r].map(|v| v as u8))) }
+        unsafe { _mm512_set1_epi32(i32::from_ne_bytes(quad.map(|v| v as u8))) }
     }
 
     #[inline(always)]

@@ -60,9 +60,9 @@ impl Dot8 for AvxVnni {
     }
 
     #[inline(always)]
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> __m256i {
+    fn prep_a(self, quad: &[i8; QUAD]) -> __m256i {
         // SAFETY: the token proves avx2.
-        unsafe { _mm256_set1_epi32(i32::from_ne_bytes(rows[r].map(|v| v as u8))) }
+        unsafe { _mm256_set1_epi32(i32::from_ne_bytes(quad.map(|v| v as u8))) }
     }
 
     #[inline(always)]

@@ -1,7 +1,7 @@
 //! NEON without a byte dot product: sixteen outputs are four 128-bit registers.
 //!
 //! Bytes multiply to 16 bits; neighbouring products (at most 2 * 127 * 127 = 32,258) are added in 16 bits, and pairs of
-//! those into the 32-bit sums. Tile 4 x 16: 16 sums, 4 weights, a broadcast and temporaries of 32 registers.
+//! those into the 32-bit sums. Tile 4 x 16: 16 sums, 4 weights, a broadcast and 8 temporaries of 32 registers.
 #![allow(unsafe_code)]
 
 use super::pack::{QUAD, STEP};
@@ -22,18 +22,44 @@ impl Neon {
     }
 }
 
-/// Four outputs: acc + w . a.
+/// Sixteen outputs: acc + w . a.
+///
+/// In assembly because the compiler sees that both halves of `a` are equal, replaces each second-half product by a move of
+/// the weights and runs out of registers. Four chains side by side also suit cores that execute in order.
 ///
 /// # Safety
 /// The CPU has neon.
 #[inline(always)]
-unsafe fn dot4(acc: int32x4_t, a: int8x16_t, w: int8x16_t) -> int32x4_t {
-    // SAFETY: the caller's promise.
+unsafe fn dot16(acc: [int32x4_t; 4], a: int8x16_t, w: [int8x16_t; 4]) -> [int32x4_t; 4] {
+    let [mut s0, mut s1, mut s2, mut s3] = acc;
+    // SAFETY: the caller's promise; touches only its operands.
     unsafe {
-        let low = vmull_s8(vget_low_s8(w), vget_low_s8(a));
-        let high = vmull_high_s8(w, a);
-        vpadalq_s16(acc, vpaddq_s16(low, high))
+        std::arch::asm!(
+            "smull  {l0:v}.8h, {w0:v}.8b, {a:v}.8b",
+            "smull  {l1:v}.8h, {w1:v}.8b, {a:v}.8b",
+            "smull  {l2:v}.8h, {w2:v}.8b, {a:v}.8b",
+            "smull  {l3:v}.8h, {w3:v}.8b, {a:v}.8b",
+            "smull2 {h0:v}.8h, {w0:v}.16b, {a:v}.16b",
+            "smull2 {h1:v}.8h, {w1:v}.16b, {a:v}.16b",
+            "smull2 {h2:v}.8h, {w2:v}.16b, {a:v}.16b",
+            "smull2 {h3:v}.8h, {w3:v}.16b, {a:v}.16b",
+            "addp   {l0:v}.8h, {l0:v}.8h, {h0:v}.8h",
+            "addp   {l1:v}.8h, {l1:v}.8h, {h1:v}.8h",
+            "addp   {l2:v}.8h, {l2:v}.8h, {h2:v}.8h",
+            "addp   {l3:v}.8h, {l3:v}.8h, {h3:v}.8h",
+            "sadalp {s0:v}.4s, {l0:v}.8h",
+            "sadalp {s1:v}.4s, {l1:v}.8h",
+            "sadalp {s2:v}.4s, {l2:v}.8h",
+            "sadalp {s3:v}.4s, {l3:v}.8h",
+            s0 = inout(vreg) s0, s1 = inout(vreg) s1, s2 = inout(vreg) s2, s3 = inout(vreg) s3,
+            w0 = in(vreg) w[0], w1 = in(vreg) w[1], w2 = in(vreg) w[2], w3 = in(vreg) w[3],
+            a = in(vreg) a,
+            l0 = out(vreg) _, l1 = out(vreg) _, l2 = out(vreg) _, l3 = out(vreg) _,
+            h0 = out(vreg) _, h1 = out(vreg) _, h2 = out(vreg) _, h3 = out(vreg) _,
+            options(pure, nomem, nostack, preserves_flags)
+        );
     }
+    [s0, s1, s2, s3]
 }
 
 /// Four registers from 64 bytes.
@@ -102,15 +128,15 @@ impl Dot8 for Neon {
     }
 
     #[inline(always)]
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> int8x16_t {
+    fn prep_a(self, quad: &[i8; QUAD]) -> int8x16_t {
         // SAFETY: the token proves neon.
-        unsafe { vreinterpretq_s8_s32(vdupq_n_s32(i32::from_ne_bytes(rows[r].map(|v| v as u8)))) }
+        unsafe { vreinterpretq_s8_s32(vdupq_n_s32(i32::from_ne_bytes(quad.map(|v| v as u8)))) }
     }
 
     #[inline(always)]
     fn dot(self, acc: Self::Acc, a: int8x16_t, w: Self::W) -> Self::Acc {
         // SAFETY: the token proves neon.
-        unsafe { [dot4(acc[0], a, w[0]), dot4(acc[1], a, w[1]), dot4(acc[2], a, w[2]), dot4(acc[3], a, w[3])] }
+        unsafe { dot16(acc, a, w) }
     }
 }
 

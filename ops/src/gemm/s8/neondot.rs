@@ -64,8 +64,7 @@ unsafe fn dot16<const LANE: usize>(acc: [int32x4_t; 4], w: [int8x16_t; 4], a: in
 // Every SAFETY line below: the token proves the features; array references give the bounds.
 impl Dot8 for NeonDot {
     type W = [int8x16_t; 4];
-    /// Four rows and which of them; the number is known when the tile is compiled.
-    type A = (int8x16_t, usize);
+    type A = int8x16_t;
     type Acc = [int32x4_t; 4];
 
     #[inline(always)]
@@ -93,32 +92,55 @@ impl Dot8 for NeonDot {
     }
 
     #[inline(always)]
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> Self::A {
-        let group = &rows[r / 4 * 4..];
-        // SAFETY: the token proves neon; the array references bound each load.
-        unsafe {
-            if let Some(four) = group.first_chunk::<4>() {
-                return (vld1q_s8(four.as_ptr().cast()), r % 4);
-            }
-            if let Some(two) = group.first_chunk::<2>()
-                && r % 4 < 2
-            {
-                let low = vld1_s8(two.as_ptr().cast());
-                return (vcombine_s8(low, low), r % 4);
-            }
-            (vreinterpretq_s8_s32(vdupq_n_s32(i32::from_ne_bytes(rows[r].map(|v| v as u8)))), 0)
-        }
+    fn prep_a(self, quad: &[i8; QUAD]) -> int8x16_t {
+        // SAFETY: the token proves neon.
+        unsafe { vreinterpretq_s8_s32(vdupq_n_s32(i32::from_ne_bytes(quad.map(|v| v as u8)))) }
     }
 
     #[inline(always)]
-    fn dot(self, acc: Self::Acc, (a, lane): Self::A, w: Self::W) -> Self::Acc {
+    fn dot(self, acc: Self::Acc, a: int8x16_t, w: Self::W) -> Self::Acc {
         // SAFETY: the token proves dotprod.
-        unsafe {
-            match lane {
-                0 => dot16::<0>(acc, w, a),
-                1 => dot16::<1>(acc, w, a),
-                2 => dot16::<2>(acc, w, a),
-                _ => dot16::<3>(acc, w, a),
+        unsafe { dot16::<0>(acc, w, a) }
+    }
+
+    /// Four rows from one load, then two, then one.
+    #[inline(always)]
+    fn step<const MR: usize, const NV: usize>(
+        self,
+        acc: &mut [[Self::Acc; NV]; MR],
+        rows: &[[i8; QUAD]; MR],
+        w: &[Self::W; NV],
+    ) {
+        let mut r = 0;
+        while let Some(four) = rows[r..].first_chunk::<4>() {
+            // SAFETY: the token proves neon and dotprod; 16 bytes are readable.
+            unsafe {
+                let a = vld1q_s8(four.as_ptr().cast());
+                for v in 0..NV {
+                    acc[r][v] = dot16::<0>(acc[r][v], w[v], a);
+                    acc[r + 1][v] = dot16::<1>(acc[r + 1][v], w[v], a);
+                    acc[r + 2][v] = dot16::<2>(acc[r + 2][v], w[v], a);
+                    acc[r + 3][v] = dot16::<3>(acc[r + 3][v], w[v], a);
+                }
+            }
+            r += 4;
+        }
+        if let Some(two) = rows[r..].first_chunk::<2>() {
+            // SAFETY: the token proves neon and dotprod; 8 bytes are readable.
+            unsafe {
+                let half = vld1_s8(two.as_ptr().cast());
+                let a = vcombine_s8(half, half);
+                for v in 0..NV {
+                    acc[r][v] = dot16::<0>(acc[r][v], w[v], a);
+                    acc[r + 1][v] = dot16::<1>(acc[r + 1][v], w[v], a);
+                }
+            }
+            r += 2;
+        }
+        if r < MR {
+            let a = self.prep_a(&rows[r]);
+            for v in 0..NV {
+                acc[r][v] = self.dot(acc[r][v], a, w[v]);
             }
         }
     }

@@ -42,8 +42,8 @@ impl Dot8 for Scalar {
     }
 
     #[inline(always)]
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> [i8; QUAD] {
-        rows[r]
+    fn prep_a(self, quad: &[i8; QUAD]) -> [i8; QUAD] {
+        *quad
     }
 
     #[inline(always)]

@@ -29,10 +29,25 @@ pub(crate) trait Dot8: Copy {
     fn store(self, acc: Self::Acc, x: &mut [i32; LANES]);
     /// One step of a panel.
     fn load_w(self, x: &[i8; STEP]) -> Self::W;
-    /// Row `r` of one step of the packed rows, in the form that the instruction wants.
-    fn prep_a(self, rows: &[[i8; QUAD]], r: usize) -> Self::A;
+    /// One row's activations, in the form that the instruction wants.
+    fn prep_a(self, quad: &[i8; QUAD]) -> Self::A;
     /// acc + the four products of each output.
     fn dot(self, acc: Self::Acc, a: Self::A, w: Self::W) -> Self::Acc;
+    /// One step of the whole tile. An instruction set that takes several rows from one register has its own.
+    #[inline(always)]
+    fn step<const MR: usize, const NV: usize>(
+        self,
+        acc: &mut [[Self::Acc; NV]; MR],
+        rows: &[[i8; QUAD]; MR],
+        w: &[Self::W; NV],
+    ) {
+        for r in 0..MR {
+            let a = self.prep_a(&rows[r]);
+            for v in 0..NV {
+                acc[r][v] = self.dot(acc[r][v], a, w[v]);
+            }
+        }
+    }
 }
 
 /// One step of a product.
@@ -76,12 +91,7 @@ pub(crate) fn body<D: Dot8, const MR: usize, const NV: usize>(d: D, t: TileS8) {
         for v in 1..NV {
             w[v] = d.load_w(&panels[v][i]);
         }
-        for r in 0..MR {
-            let x = d.prep_a(&a[i], r);
-            for v in 0..NV {
-                acc[r][v] = d.dot(acc[r][v], x, w[v]);
-            }
-        }
+        d.step(&mut acc, &a[i], &w);
     }
     for v in 0..NV {
         let sums = &mut t.acc[v * t.acc_stride..][..MR * LANES].as_chunks_mut::<LANES>().0[..MR];
@@ -112,13 +122,7 @@ pub(crate) fn peak_body<D: Dot8, const MR: usize, const NV: usize>(d: D, seed: i
         quad[0] = r as i8;
     }
     for _ in 0..PEAK_STEPS {
-        let rows = std::hint::black_box(&rows);
-        for r in 0..MR {
-            let a = d.prep_a(rows, r);
-            for v in 0..NV {
-                acc[r][v] = d.dot(acc[r][v], a, w[v]);
-            }
-        }
+        d.step(&mut acc, std::hint::black_box(&rows), &w);
     }
     for r in 0..MR {
         for v in 0..NV {
