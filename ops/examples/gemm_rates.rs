@@ -1,6 +1,6 @@
 //! Speed of the int8 product against the measured int8 peak of this CPU:
 //!
-//! `cargo run --release -p sf-ops --example gemm_rates [ROUNDS]`
+//! `cargo run --release -p sf-ops --example gemm_rates [ROUNDS [THREADS [MxKxN]]]`
 //!
 //! Every shape is checked against the definition first, then timed; times are the best of interleaved rounds. The peak of
 //! two threads is two threads running the probe at once.
@@ -35,6 +35,7 @@ struct Case {
     a: Vec<i8>,
     a_scales: Vec<f32>,
     w: Vec<i8>,
+    panels: std::ops::Range<usize>,
     scales: Vec<f32>,
     sums: Vec<i32>,
     bias: Vec<f32>,
@@ -55,14 +56,18 @@ impl Case {
             row[..k].fill_with(&mut value);
         }
         let plain: Vec<i8> = (0..n * k).map(|_| value()).collect();
-        let mut w = vec![0; panel_len_s8(n, k)];
-        pack_s8(&plain, n, k, &mut w);
-        let sums = col_sums(&w, n, k);
+        // On a cache line, as in a weight file.
+        let mut w = vec![0; panel_len_s8(n, k) + 64];
+        let at = w.as_ptr().align_offset(64);
+        let panels = at..at + panel_len_s8(n, k);
+        pack_s8(&plain, n, k, &mut w[panels.clone()]);
+        let sums = col_sums(&w[panels.clone()], n, k);
         let case = Case {
             size,
             a,
             a_scales: vec![0.01; m],
             w,
+            panels,
             scales: vec![0.02; n],
             sums,
             bias: vec![0.5; n],
@@ -77,7 +82,13 @@ impl Case {
     }
 
     fn panels(&self) -> PanelsS8<'_> {
-        PanelsS8 { n: self.size.2, k: self.size.1, data: &self.w, scales: &self.scales, col_sums: &self.sums }
+        PanelsS8 {
+            n: self.size.2,
+            k: self.size.1,
+            data: &self.w[self.panels.clone()],
+            scales: &self.scales,
+            col_sums: &self.sums,
+        }
     }
 
     fn check(&self, plain: &[i8]) {
@@ -117,11 +128,15 @@ fn peak_of(threads: usize) -> f64 {
 }
 
 fn main() {
-    let rounds: usize = std::env::args().nth(1).and_then(|v| v.parse().ok()).unwrap_or(20);
+    let number = |i| std::env::args().nth(i).and_then(|v| v.parse::<usize>().ok());
+    let rounds = number(1).unwrap_or(20);
+    let threads = number(2).map_or(vec![1, 2], |n| vec![n]);
+    let only = std::env::args().nth(3);
+    let wanted = |&(m, k, n): &(usize, usize, usize)| only.as_ref().is_none_or(|o| *o == format!("{m}x{k}x{n}"));
     println!("{}, {rounds} rounds", Kernels::best().gemm_s8.name);
     println!("threads     M     K     N        ms    GOP/s  of peak  with gelu");
-    let mut cases: Vec<Case> = SHAPES.into_iter().map(Case::new).collect();
-    for threads in [1, 2] {
+    let mut cases: Vec<Case> = SHAPES.into_iter().filter(wanted).map(Case::new).collect();
+    for threads in threads {
         let pool = Pool::new(threads).expect("threads");
         let mut peak = 0.0f64;
         let mut best = vec![[f64::INFINITY; 2]; cases.len()];

@@ -39,18 +39,21 @@ use tile::{ColumnsS8, FinishS8, MAX_NV, QuadPack, TileS8};
 /// panels streaming past do not drive them out.
 const PACKED: usize = 1 << 16;
 /// Most tiles of rows per task.
-const TILES: usize = 8;
+const TILES: usize = 20;
 /// Steps of four inputs between which sums stay in registers: a pair of panels is then 32 KiB.
 const STEPS: usize = 256;
 /// Tasks wanted, so that a few threads finish together.
-const TASKS: usize = 32;
+const TASKS: usize = 8;
 /// Fewest panels per task: packing the rows again costs about 3 % of 256 columns' dot products.
 const GROUP: usize = 16;
+
+/// f32-sized values of a cache line.
+const LINE: usize = 16;
 
 /// Most f32-sized values of working memory that each thread of the pool keeps after int8 products of up to `k` inputs,
 /// whatever the kernel; for memory plans.
 pub fn working_memory_s8(k: usize) -> usize {
-    PACKED.max(MAX_MR * padded_k(k) / QUAD) + TILES * MAX_MR * MAX_NV * NR
+    PACKED.max(MAX_MR * padded_k(k) / QUAD) + TILES * MAX_MR * MAX_NV * NR + LINE
 }
 
 /// Where sums go.
@@ -92,13 +95,15 @@ fn product(ctx: Ctx, p: &Product) {
     let (mr, nv) = (p.kernel.mr, p.kernel.nr / NR);
     let row_tiles = m.div_ceil(mr);
     let most = (PACKED / (mr * steps.max(1))).clamp(1, TILES);
-    let row_tasks = row_tiles.div_ceil(most);
+    // Even shares of the rows; four or a multiple, so that two or four threads finish together.
+    let row_tasks = row_tiles.div_ceil(most).next_multiple_of(4).min(row_tiles);
     // Whole groups of the kernel's panels.
     let groups = n.div_ceil(NR).div_ceil(nv);
     let col_tasks = TASKS.div_ceil(row_tasks).clamp(1, (groups * nv).div_ceil(GROUP));
     let block = row_tiles.div_ceil(row_tasks) * mr;
 
-    let scratch = block * (steps + nv * NR);
+    let used = block * (steps + nv * NR);
+    let scratch = used + LINE;
     assert!(scratch <= working_memory_s8(p.w.k), "{scratch} values of working memory for {} inputs", p.w.k);
     ctx.pool.reserve_scratch(scratch);
     ctx.pool.run(row_tasks * col_tasks, &|task, worker| {
@@ -107,7 +112,9 @@ fn product(ctx: Ctx, p: &Product) {
         let first = tiles.start * mr;
         let rows = (tiles.end * mr).min(m) - first;
         ctx.pool.with_scratch(worker, scratch, |memory| {
-            let (packed, acc) = memory.split_at_mut(block * steps);
+            // Sums first and on a cache line: a vector across two lines costs two accesses.
+            let skip = memory.as_ptr().align_offset(LINE * size_of::<f32>()).min(LINE);
+            let (acc, packed) = memory[skip..][..used].split_at_mut(block * nv * NR);
             let packed: &mut [u32] = bytemuck::cast_slice_mut(packed);
             let acc: &mut [i32] = bytemuck::cast_slice_mut(acc);
             pack_block(ctx, p, first..first + rows, packed);
@@ -176,6 +183,9 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[u32], &m
             let rows = mr.min(part.rows - r);
             let width = p.kernel.fit(rows);
             let acc = &mut acc[tile * size..][..size];
+            if last && let Sink::Values { out, stride, .. } = &p.sink {
+                out.prefetch((part.first + r) * stride + part.panel * NR, part.panels * NR, *stride, rows);
+            }
             ctx.kernels.tile_s8(TileS8 {
                 rows: width,
                 panels: part.panels,
@@ -216,14 +226,6 @@ fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &
             }
         }
         Sink::Values { ep, out, stride } => {
-            let mut rows: [&mut [f32]; MAX_MR] = Default::default();
-            for (r, row) in rows.iter_mut().enumerate().take(part.rows) {
-                let at = (part.first + r) * stride + col;
-                // SAFETY: every output belongs to one tile of one task, and a piece lives only in this call.
-                #[allow(unsafe_code)]
-                let out = unsafe { out.slice(at..at + cols) };
-                *row = out;
-            }
             ctx.kernels.finish_s8(FinishS8 {
                 acc,
                 acc_stride,
@@ -233,7 +235,10 @@ fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &
                 act: ep.act,
                 gamma: ep.gamma.is_some(),
                 residual: ep.residual,
-                out: rows,
+                out,
+                at: part.first * stride + col,
+                stride: *stride,
+                cols,
             });
         }
     }

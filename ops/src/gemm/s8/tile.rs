@@ -8,6 +8,7 @@ use super::pack::{QUAD, STEP};
 use crate::activation::{gelu_lanes, relu_lanes};
 use crate::gemm::Act;
 use crate::gemm::pack::MAX_MR;
+use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector};
 
 /// Panels of the widest kernel.
@@ -227,8 +228,14 @@ pub(crate) struct FinishS8<'a> {
     pub gamma: bool,
     /// Whether to add to what the output holds.
     pub residual: bool,
-    /// Outputs of each row in use, from the first panel's first column.
-    pub out: [&'a mut [f32]; MAX_MR],
+    /// The whole output.
+    pub out: &'a SharedMut<'a, f32>,
+    /// Place of the tile's first value in it.
+    pub at: usize,
+    /// Values from one row to the next.
+    pub stride: usize,
+    /// Columns in use.
+    pub cols: usize,
 }
 
 /// Per-output values of the panels of a tile, zeros beyond n.
@@ -248,6 +255,7 @@ pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
         let scale = s.load(&t.columns.scales[p]);
         let bias = s.load(&t.columns.bias[p]);
         let gamma = s.load(&t.columns.gamma[p]);
+        let cols = LANES.min(t.cols - p * LANES);
         for r in 0..rows {
             let mut y = s.load_i32(&acc[r]).mul_add(s.splat(t.row_scales[r]) * scale, bias);
             match t.act {
@@ -258,7 +266,10 @@ pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
             if t.gamma {
                 y = y * gamma;
             }
-            let out = &mut t.out[r][p * LANES..];
+            let at = t.at + r * t.stride + p * LANES;
+            // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
+            #[allow(unsafe_code)]
+            let out = unsafe { t.out.slice(at..at + cols) };
             match out.first_chunk_mut::<LANES>() {
                 Some(out) => {
                     if t.residual {
