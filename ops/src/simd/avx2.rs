@@ -177,6 +177,22 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn gt_bits(self, o: V) -> u16 {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let lo = _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(self.0, o.0));
+            let hi = _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_GT_OQ>(self.1, o.1));
+            (lo | hi << 8) as u16
+        }
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe { V(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)) }
+    }
+
+    #[inline(always)]
     fn abs(self) -> V {
         // SAFETY: the vector proves avx2.
         unsafe {

@@ -150,6 +150,18 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn gt_bits(self, o: V) -> u16 {
+        // SAFETY: the vector proves avx512f.
+        unsafe { _mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, o.0) }
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe { V(_mm512_sqrt_ps(self.0)) }
+    }
+
+    #[inline(always)]
     fn abs(self) -> V {
         // SAFETY: the vector proves avx512dq.
         unsafe { V(_mm512_andnot_ps(_mm512_set1_ps(-0.0), self.0)) }

@@ -13,18 +13,21 @@
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
+mod enter;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;
 pub(crate) mod scalar;
 pub mod table;
 
+pub use enter::Body;
+
 use std::ops::{Add, Div, Mul, Sub};
 
 /// Lanes of a vector.
-pub(crate) const LANES: usize = 16;
+pub const LANES: usize = 16;
 
 /// Token of an instruction set.
-pub(crate) trait Simd: Copy {
+pub trait Simd: Copy {
     /// Its vectors.
     type V: Vector;
     /// Every lane `x`.
@@ -49,9 +52,7 @@ pub(crate) trait Simd: Copy {
 }
 
 /// Sixteen f32 lanes.
-pub(crate) trait Vector:
-    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self>
-{
+pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
     /// Lane i to `x[i]`.
     fn store(self, x: &mut [f32; LANES]);
     /// self * a + b, rounded once.
@@ -60,8 +61,12 @@ pub(crate) trait Vector:
     fn max(self, other: Self) -> Self;
     /// Lanes of `yes` where self > other, of `no` elsewhere (also for NaN).
     fn select_gt(self, other: Self, yes: Self, no: Self) -> Self;
+    /// Bit i set where lane i of self > other; clear for NaN.
+    fn gt_bits(self, other: Self) -> u16;
     /// Clears the sign bit.
     fn abs(self) -> Self;
+    /// IEEE square root; NaN below zero.
+    fn sqrt(self) -> Self;
     /// (bits(self) << 23) + (`bias` << 23) as float: 2^(n + bias - 127) when the low bits of self hold n.
     fn pow2_of_low_bits(self, bias: i32) -> Self;
     /// Flips the sign of lane i where bit i of `lanes` is set; also of zeros.

@@ -186,6 +186,26 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn gt_bits(self, o: V) -> u16 {
+        let mut bits = 0;
+        // SAFETY: the vector proves neon; the table holds 16 values.
+        unsafe {
+            for i in 0..4 {
+                let chosen = vandq_u32(vcgtq_f32(self.0[i], o.0[i]), vld1q_u32(BIT.as_ptr().add(4 * i)));
+                bits |= vaddvq_u32(chosen);
+            }
+        }
+        bits as u16
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> V {
+        let [a, b, c, d] = self.0;
+        // SAFETY: the vector proves neon.
+        unsafe { V([vsqrtq_f32(a), vsqrtq_f32(b), vsqrtq_f32(c), vsqrtq_f32(d)]) }
+    }
+
+    #[inline(always)]
     fn abs(self) -> V {
         // SAFETY: the vector proves neon.
         unsafe { V([vabsq_f32(self.0[0]), vabsq_f32(self.0[1]), vabsq_f32(self.0[2]), vabsq_f32(self.0[3])]) }

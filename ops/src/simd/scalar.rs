@@ -105,8 +105,18 @@ impl Vector for Lanes {
     }
 
     #[inline(always)]
+    fn gt_bits(self, o: Lanes) -> u16 {
+        (0..LANES).fold(0, |bits, i| bits | u16::from(self.0[i] > o.0[i]) << i)
+    }
+
+    #[inline(always)]
     fn abs(self) -> Lanes {
         Lanes(self.0.map(f32::abs))
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Lanes {
+        Lanes(self.0.map(f32::sqrt))
     }
 
     #[inline(always)]
@@ -230,8 +240,18 @@ impl Vector for Lane {
     }
 
     #[inline(always)]
+    fn gt_bits(self, o: Lane) -> u16 {
+        u16::from(self.0 > o.0)
+    }
+
+    #[inline(always)]
     fn abs(self) -> Lane {
         Lane(self.0.abs())
+    }
+
+    #[inline(always)]
+    fn sqrt(self) -> Lane {
+        Lane(self.0.sqrt())
     }
 
     #[inline(always)]
