@@ -4,19 +4,77 @@
 //! entries per tile, and scatters their keys by a counting sort. A tile's list is the concatenation of
 //! the groups' parts, so no two threads write to one list and the result does not depend on their number.
 //!
-//! Key, 64 bits: `z bits (32) | group (4) | record in the group (28)`. z is positive, so the bits order
-//! like the number; groups and records ascend with the Gaussian's index, so sorting whole keys
-//! breaks ties by index, and no two keys are equal.
+//! Key, 64 bits, see [`KeyForm`]: depth, group, record in the group, and where the form has room the rectangle
+//! of 4x4 blocks that the record meets in the tile. z is positive, so its bits order like the number and the sign
+//! is left out; groups and records ascend with the Gaussian's index, so sorting whole keys breaks ties by
+//! index, and no two keys of a tile are equal.
 
 use sf_formats::scene::Gaussians;
+use sf_ops::Kernels;
 
-use crate::project::{Counts, Projector, Record};
+use crate::project::{Counts, Project, Projector, Record, Rect, TILE};
 
 /// Number of runs the scene is cut into. Fixed, not the number of threads.
 pub const GROUPS: usize = 16;
-const RECORD_BITS: u32 = 28;
 /// Most Gaussians a scene may have: what the keys can name.
-pub const MAX_GAUSSIANS: usize = GROUPS << RECORD_BITS;
+pub const MAX_GAUSSIANS: usize = GROUPS << (32 - GROUP_BITS);
+const GROUP_BITS: u32 = 4;
+
+/// How a key is packed. Depth is the 31 bits of z without the sign, at the top.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum KeyForm {
+    /// `z (31) | group (4) | record (17) | rectangle (12)`, for scenes of up to 2^21 Gaussians.
+    Short,
+    /// `z (31) | 0 | group (4) | record (28)`; the rectangle is looked up in the record.
+    Long,
+}
+
+impl KeyForm {
+    const RECT_BITS: u32 = 12;
+    const SHORT_RECORD_BITS: u32 = 17;
+
+    /// The form for a scene.
+    pub fn of(gaussians: usize) -> KeyForm {
+        if gaussians.div_ceil(GROUPS) <= 1 << Self::SHORT_RECORD_BITS { KeyForm::Short } else { KeyForm::Long }
+    }
+
+    #[inline(always)]
+    fn pack(self, z: f32, group: usize, record: usize, rect: Rect) -> u64 {
+        let z = u64::from(z.to_bits()) << 33;
+        match self {
+            KeyForm::Short => {
+                let name = group << Self::SHORT_RECORD_BITS | record;
+                z | (name as u64) << Self::RECT_BITS | u64::from(rect.pack())
+            }
+            KeyForm::Long => z | (group << (32 - GROUP_BITS) | record) as u64,
+        }
+    }
+
+    /// A number that ascends with depth and is equal only for equal depths.
+    #[inline(always)]
+    pub fn depth(self, key: u64) -> u64 {
+        key >> 33
+    }
+
+    /// The group and the record that a key names.
+    #[inline(always)]
+    pub fn locate(self, key: u64) -> (usize, usize) {
+        let (name, bits) = match self {
+            KeyForm::Short => ((key >> Self::RECT_BITS) as usize, Self::SHORT_RECORD_BITS),
+            KeyForm::Long => (key as usize, 32 - GROUP_BITS),
+        };
+        (name >> bits & (GROUPS - 1), name & ((1 << bits) - 1))
+    }
+
+    /// The mask of the blocks that a key meets; `look` finds it where the key does not hold it.
+    #[inline(always)]
+    pub fn blocks(self, key: u64, look: impl FnOnce() -> u64) -> u64 {
+        match self {
+            KeyForm::Short => Rect::unpack(key as u32 & ((1 << Self::RECT_BITS) - 1)).blocks(),
+            KeyForm::Long => look(),
+        }
+    }
+}
 
 /// The run of consecutive Gaussians of one group.
 pub fn run(gaussians: usize, group: usize) -> std::ops::Range<usize> {
@@ -39,33 +97,27 @@ pub struct Group {
 }
 
 impl Group {
-    /// Projects a run of the scene. `usable(i)` is a further test of Gaussian `i`; those that fail it
-    /// count as not finite.
+    /// Projects a run of the scene. `usable(i)` is a further test of a visible Gaussian `i`; those that fail
+    /// it count as not finite.
     pub fn project(
         &mut self,
+        kernels: &Kernels,
         projector: &Projector,
         scene: &Gaussians,
         run: std::ops::Range<usize>,
-        usable: &dyn Fn(usize) -> bool,
+        usable: Option<&(dyn Fn(usize) -> bool + Sync)>,
     ) {
         self.records.clear();
         self.counts = Counts::default();
-        self.entries = 0;
-        for i in run {
-            let Some(record) = projector.project(scene, i, &mut self.counts) else { continue };
-            if !usable(i) {
-                self.counts.nonfinite += 1;
-                continue;
-            }
-            self.entries += record.tiles();
-            self.records.push(record);
-        }
+        let (records, counts) = (&mut self.records, &mut self.counts);
+        kernels.enter(Project { projector, scene, run, usable, records, counts });
+        self.entries = self.records.iter().map(Record::tiles).sum();
     }
 
     /// Scatters the keys of the records to the tiles of an image of `tiles` (columns, rows).
     ///
     /// Panics if there are 2^32 entries or more; the caller has a lower limit.
-    pub fn bin(&mut self, group: usize, tiles: (u32, u32)) {
+    pub fn bin(&mut self, group: usize, form: KeyForm, tiles: (u32, u32)) {
         let count = tiles.0 as usize * tiles.1 as usize;
         let entries = u32::try_from(self.entries).expect("fewer than 2^32 entries");
         self.starts.clear();
@@ -73,16 +125,15 @@ impl Group {
         self.keys.clear();
         self.keys.resize(entries as usize, 0);
         for r in &self.records {
-            each_tile(r, tiles.0, |t| self.starts[t + 1] += 1);
+            each_tile(r, tiles.0, |t, _| self.starts[t + 1] += 1);
         }
         for t in 0..count {
             self.starts[t + 1] += self.starts[t];
         }
         // Filling moves every start to its end, which is the next one's start; shifted back below.
         for (i, r) in self.records.iter().enumerate() {
-            let key = u64::from(r.z.to_bits()) << 32 | (group << RECORD_BITS | i) as u64;
-            each_tile(r, tiles.0, |t| {
-                self.keys[self.starts[t] as usize] = key;
+            each_tile(r, tiles.0, |t, place| {
+                self.keys[self.starts[t] as usize] = form.pack(r.z, group, i, r.rect(place));
                 self.starts[t] += 1;
             });
         }
@@ -98,19 +149,13 @@ impl Group {
     }
 }
 
-/// The group and the record that a key names.
+/// Calls `f` with the number and the first pixel of every tile that a record meets.
 #[inline(always)]
-pub fn locate(key: u64) -> (usize, usize) {
-    let low = key as u32 as usize;
-    (low >> RECORD_BITS, low & ((1 << RECORD_BITS) - 1))
-}
-
-#[inline(always)]
-fn each_tile(r: &Record, columns: u32, mut f: impl FnMut(usize)) {
+fn each_tile(r: &Record, columns: u32, mut f: impl FnMut(usize, (usize, usize))) {
     let (x, y) = r.tile_box();
     for ty in y.0..y.1 {
         for tx in x.0..x.1 {
-            f((ty * columns + tx) as usize);
+            f((ty * columns + tx) as usize, ((tx * TILE) as usize, (ty * TILE) as usize));
         }
     }
 }
@@ -126,8 +171,27 @@ mod tests {
             assert_eq!(run(n, GROUPS - 1).end, n);
             for g in 1..GROUPS {
                 assert_eq!(run(n, g).start, run(n, g - 1).end);
-                assert!(run(n, g).len() <= 1 << RECORD_BITS);
+                assert!(run(n, g).len() <= 1 << (32 - GROUP_BITS));
             }
         }
+    }
+
+    #[test]
+    fn keys_name_their_record_and_order_by_depth_then_index() {
+        let rect = Rect { x: (1, 6), y: (0, 7) };
+        for (form, last) in [(KeyForm::Short, (1 << 17) - 1), (KeyForm::Long, (1 << 28) - 1)] {
+            let names = [(0, 0), (0, last), (7, 5), (15, 0), (15, last)];
+            let keys: Vec<u64> = [0.01f32, 0.011, 4.0, 1e10]
+                .iter()
+                .flat_map(|&z| names.map(|(g, r)| form.pack(z, g, r, rect)))
+                .collect();
+            assert!(keys.windows(2).all(|k| k[0] < k[1]));
+            for (key, name) in keys.iter().zip(names.iter().cycle()) {
+                assert_eq!(form.locate(*key), *name);
+                assert_eq!(form.blocks(*key, || rect.blocks()), rect.blocks());
+            }
+        }
+        assert_eq!(KeyForm::of(2 << 20), KeyForm::Short);
+        assert_eq!(KeyForm::of((2 << 20) + 1), KeyForm::Long);
     }
 }

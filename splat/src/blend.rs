@@ -1,36 +1,71 @@
 //! One tile, front to back.
 //!
-//! The tile is 32 rows of four [`Octet`]s of eight pixels. A Gaussian visits, row by row, the octets
-//! that meet the run of pixels where its sigma is below the cut; within an octet all eight lanes
-//! compute and the alpha test selects. Every step of a lane is one IEEE operation in a fixed order,
-//! so any vector width gives the same bits.
+//! A tile is 32x32 pixels in 64 blocks of 4x4, one vector of sixteen lanes each. Its list of keys is split into
+//! buckets of depth, and only the bucket about to be drawn is filtered and sorted: entries that meet nothing
+//! but finished blocks are dropped by one AND of 64-bit masks. Up to [`CHUNK`] entries in order are then dealt
+//! out to the blocks they meet, and every block takes its list in one go with its state in registers.
+//! A pixel sees its Gaussians in key order whatever the chunks are.
 //!
-//! T carries the sign of life: a finished pixel holds -T, which keeps T for the output.
+//! ```text
+//! d = cx (X - u) - sl (Y - v),  e = ar (Y - v),  x = d^2 + e^2 - log2(opacity),  alpha = min(a_max, 2^-x)
+//! ```
 //!
-//! Most entries of a dense scene lie behind finished pixels, so keys are sorted in doubling pieces,
-//! nearest piece first, and the tile ends when no pixel is alive.
+//! T carries the sign of life: a finished pixel holds -T, which keeps T for the output, and no alpha makes
+//! a negative T pass the test of the next T.
 
-use crate::math::exp_neg;
-use crate::project::{ALPHA_CUT, MARGIN, Record, TILE};
+use sf_ops::simd::{Body, LANES, Simd, Vector};
+
+use crate::bin::{self, KeyForm};
+use crate::math::exp2_neg;
+use crate::project::{Record, TILE, X_CUT};
 
 /// A pixel is finished when its next T would be at or below this.
 pub const T_STOP: f32 = 1e-4;
-/// Pixels handled together.
-pub const LANES: usize = 8;
+/// Side of a block in pixels.
+pub const BLOCK: usize = 4;
 const SIDE: usize = TILE as usize;
-const PER_ROW: usize = SIDE / LANES;
-/// Keys sorted first; every further piece is twice as long. About what fills a tile of a dense scene.
-const FIRST_PIECE: usize = 512;
-/// Gaussians between two looks for finished octets.
-const LOOK: usize = 32;
+/// Blocks in a row of a tile.
+const PER_ROW: usize = SIDE / BLOCK;
+/// Blocks of a tile: the bits of a mask.
+const BLOCKS: usize = PER_ROW * PER_ROW;
+/// Entries dealt out together: 12 KiB of them and at most 16 KiB of lists stay in the first-level cache.
+const CHUNK: usize = 256;
+/// Most depth buckets of a list.
+const BUCKETS: usize = 1024;
 
-/// State of eight neighbouring pixels of a row.
+/// Column of a lane in its block.
+const LANE_X: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
+/// Row of a lane in its block.
+const LANE_Y: [f32; LANES] = [0., 0., 0., 0., 1., 1., 1., 1., 2., 2., 2., 2., 3., 3., 3., 3.];
+
+/// State of sixteen pixels; five cache lines.
 #[derive(Clone, Copy, Debug)]
-pub struct Octet {
+#[repr(align(64))]
+struct Block {
     /// Transmittance, negated when the pixel is finished.
     t: [f32; LANES],
     /// Sum of T alpha times red, green, blue, z.
     sum: [[f32; LANES]; 4],
+}
+
+/// A Gaussian in the coordinates of a tile: X and Y count pixel centres from the tile's first.
+#[derive(Clone, Copy, Debug, Default)]
+struct Shown {
+    /// d of the tile's first pixel.
+    d: f32,
+    /// Change of d per column.
+    cx: f32,
+    /// Change of d per row.
+    dy: f32,
+    /// e of the tile's first row.
+    e: f32,
+    /// Change of e per row.
+    ar: f32,
+    /// -log2(opacity).
+    nlo: f32,
+    /// Red, green, blue, z.
+    value: [f32; 4],
+    index: u32,
 }
 
 /// Where a tile lies: its first pixel and how many of its columns and rows are inside the image.
@@ -58,159 +93,301 @@ pub struct Channels<'a> {
 /// One tile's pixels and its list; the memory is kept between tiles.
 #[derive(Debug)]
 pub struct Tile {
-    octets: Box<[Octet; SIDE * PER_ROW]>,
-    alive: [bool; SIDE * PER_ROW],
-    /// `[pixel of the tile, channels]`.
-    extra: Vec<f32>,
-    keys: Vec<u64>,
+    blocks: Box<[Block; BLOCKS]>,
+    /// Bit b set while block b has an unfinished pixel.
+    alive: u64,
+    /// `[block, channel][lane]`.
+    extra: Vec<[f32; LANES]>,
+    /// The list as it came, then the list by depth bucket.
+    keys: [Vec<u64>; 2],
+    /// `starts[b]` of bucket b, one more for the end.
+    starts: Box<[u32; BUCKETS + 1]>,
+    chunk: Box<Chunk>,
+    updates: u64,
+}
+
+/// Entries in order and, per block, which of them it takes.
+#[derive(Debug)]
+struct Chunk {
+    shown: [Shown; CHUNK],
+    len: usize,
+    lists: [[u8; CHUNK]; BLOCKS],
+    lens: [u16; BLOCKS],
 }
 
 impl Default for Tile {
     fn default() -> Self {
-        let empty = Octet { t: [1.0; LANES], sum: [[0.0; LANES]; 4] };
         Tile {
-            octets: Box::new([empty; SIDE * PER_ROW]),
-            alive: [true; SIDE * PER_ROW],
+            blocks: Box::new([Block { t: [1.0; LANES], sum: [[0.0; LANES]; 4] }; BLOCKS]),
+            alive: 0,
             extra: Vec::new(),
-            keys: Vec::new(),
+            keys: [Vec::new(), Vec::new()],
+            starts: Box::new([0; BUCKETS + 1]),
+            chunk: Box::new(Chunk {
+                shown: [Shown::default(); CHUNK],
+                len: 0,
+                lists: [[0; CHUNK]; BLOCKS],
+                lens: [0; BLOCKS],
+            }),
+            updates: 0,
         }
+    }
+}
+
+/// What the tiles of an image share.
+#[derive(Clone, Copy, Debug)]
+pub struct Shared<'a> {
+    /// The records of every group.
+    pub records: [&'a [Record]; bin::GROUPS],
+    /// How keys name them.
+    pub form: KeyForm,
+    /// Largest alpha.
+    pub a_max: f32,
+    /// Further values.
+    pub extra: Channels<'a>,
+}
+
+impl Shared<'_> {
+    #[inline(always)]
+    fn record(&self, key: u64) -> &Record {
+        let (group, record) = self.form.locate(key);
+        &self.records[group][record]
+    }
+}
+
+/// Composites the list of a tile in key order.
+#[derive(Debug)]
+pub struct Blend<'a> {
+    /// The tile, cleared and with its list.
+    pub tile: &'a mut Tile,
+    /// Where it lies.
+    pub place: Place,
+    /// The image.
+    pub shared: &'a Shared<'a>,
+}
+
+impl Body for Blend<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Blend { tile, place, shared } = self;
+        let form = shared.form;
+        let buckets = tile.split(form);
+        for b in 0..buckets {
+            let (start, end) = (tile.starts[b] as usize, tile.starts[b + 1] as usize);
+            let mut kept = start;
+            for i in start..end {
+                let key = tile.keys[1][i];
+                let mask = form.blocks(key, || shared.record(key).blocks((place.x, place.y)));
+                tile.keys[1][kept] = key;
+                kept += usize::from(mask & tile.alive != 0);
+            }
+            sort(&mut tile.keys[1][start..kept]);
+            for i in start..kept {
+                let key = tile.keys[1][i];
+                let record = shared.record(key);
+                tile.deal(record, place, form.blocks(key, || record.blocks((place.x, place.y))));
+                if tile.chunk.len == CHUNK {
+                    tile.draw(s, shared);
+                    if tile.alive == 0 {
+                        return;
+                    }
+                }
+            }
+        }
+        tile.draw(s, shared);
+    }
+}
+
+/// Keys of one bucket: some ten, rarely many.
+#[inline(always)]
+fn sort(keys: &mut [u64]) {
+    if keys.len() > 1 {
+        keys.sort_unstable();
     }
 }
 
 impl Tile {
     /// Starts a tile: T = 1 inside the image, finished outside, and an empty list.
     pub fn clear(&mut self, place: Place, channels: usize) {
-        for (i, octet) in self.octets.iter_mut().enumerate() {
-            let (y, x0) = (i / PER_ROW, i % PER_ROW * LANES);
+        self.alive = 0;
+        for (i, block) in self.blocks.iter_mut().enumerate() {
+            let (y0, x0) = (i / PER_ROW * BLOCK, i % PER_ROW * BLOCK);
             for l in 0..LANES {
-                octet.t[l] = if y < place.height && x0 + l < place.width { 1.0 } else { -1.0 };
+                let inside = y0 + l / BLOCK < place.height && x0 + l % BLOCK < place.width;
+                block.t[l] = if inside { 1.0 } else { -1.0 };
             }
-            octet.sum = [[0.0; LANES]; 4];
+            block.sum = [[0.0; LANES]; 4];
+            self.alive |= u64::from(y0 < place.height && x0 < place.width) << i;
         }
         self.extra.clear();
-        self.extra.resize(SIDE * SIDE * channels, 0.0);
-        self.keys.clear();
+        self.extra.resize(BLOCKS * channels, [0.0; LANES]);
+        self.keys[0].clear();
+        self.chunk.len = 0;
+        self.chunk.lens = [0; BLOCKS];
+        self.updates = 0;
     }
 
     /// Adds keys to the list.
     pub fn push(&mut self, keys: &[u64]) {
-        self.keys.extend_from_slice(keys);
+        self.keys[0].extend_from_slice(keys);
     }
 
-    /// Composites the list in key order. `record` finds the record of a key.
-    pub fn blend<'r>(&mut self, place: Place, a_max: f32, extra: Channels, record: impl Fn(u64) -> &'r Record) {
-        let mut keys = std::mem::take(&mut self.keys);
-        let mut rest = &mut keys[..];
-        let mut piece = FIRST_PIECE;
-        while !rest.is_empty() && self.look() {
-            let n = piece.min(rest.len());
-            if n < rest.len() {
-                rest.select_nth_unstable(n - 1);
-            }
-            let (now, later) = rest.split_at_mut(n);
-            now.sort_unstable();
-            for (i, &key) in now.iter().enumerate() {
-                if i % LOOK == LOOK - 1 && !self.look() {
-                    break;
-                }
-                self.add(place, a_max, extra, record(key));
-            }
-            rest = later;
-            piece *= 2;
+    /// Blocks that took a Gaussian since [`Tile::clear`], counted once per pair.
+    pub fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    /// Orders the list by bucket of depth, not inside a bucket, and returns the number of buckets.
+    fn split(&mut self, form: KeyForm) -> usize {
+        let [list, split] = &mut self.keys;
+        split.clear();
+        split.resize(list.len(), 0);
+        let (mut least, mut most) = (u64::MAX, 0);
+        for &key in &*list {
+            least = least.min(key);
+            most = most.max(key);
         }
-        self.keys = keys;
-    }
-
-    /// Marks the octets that still have a pixel alive; whether there is one.
-    fn look(&mut self) -> bool {
-        let mut any = false;
-        for (alive, octet) in self.alive.iter_mut().zip(self.octets.iter()) {
-            let mut most = octet.t[0];
-            for &t in &octet.t[1..] {
-                most = if t > most { t } else { most };
-            }
-            *alive = most > 0.0;
-            any |= *alive;
+        let Some(range) = form.depth(most).checked_sub(form.depth(least)) else { return 0 };
+        let least = form.depth(least);
+        // The shift that leaves the range just under the number of buckets: about 8 entries in each.
+        let wanted = (list.len() / 8).next_power_of_two().clamp(1, BUCKETS);
+        let shift = (u64::BITS - range.leading_zeros()).saturating_sub(wanted.trailing_zeros());
+        let bucket = |key: u64| ((form.depth(key) - least) >> shift) as usize & (BUCKETS - 1);
+        let buckets = (range >> shift) as usize + 1;
+        self.starts[..=buckets].fill(0);
+        for &key in &*list {
+            self.starts[bucket(key) + 1] += 1;
         }
-        any
+        for b in 0..buckets {
+            self.starts[b + 1] += self.starts[b];
+        }
+        // Filling moves every start to its end, which is the next one's start; shifted back below.
+        for &key in &*list {
+            let at = &mut self.starts[bucket(key)];
+            split[*at as usize] = key;
+            *at += 1;
+        }
+        for b in (0..buckets).rev() {
+            self.starts[b + 1] = self.starts[b];
+        }
+        self.starts[0] = 0;
+        buckets
     }
 
-    /// Composites one Gaussian.
-    fn add(&mut self, place: Place, a_max: f32, extra: Channels, r: &Record) {
-        let first_row = usize::from(r.y.0).max(place.y) - place.y;
-        let last_row = (usize::from(r.y.1) - place.y).min(SIDE);
-        let first = (usize::from(r.x.0).max(place.x) - place.x) as f64;
-        let last = (usize::from(r.x.1) - 1 - place.x).min(SIDE - 1) as f64;
-        // From here columns count from the tile's first pixel centre.
-        let u = r.u - (place.x as f64 + 0.5);
-        for row in first_row..last_row {
-            let dy = (place.y + row) as f64 + 0.5 - r.v;
-            let base = (r.row_k * dy * dy) as f32;
-            let left = r.cut - base + MARGIN as f32;
-            if left < 0.0 {
+    /// Appends a Gaussian to the chunk and to the lists of the unfinished ones of `blocks`.
+    #[inline(always)]
+    fn deal(&mut self, r: &Record, place: Place, blocks: u64) {
+        let chunk = &mut *self.chunk;
+        let at = chunk.len % CHUNK;
+        let (x, y) = (place.x as f32 - f32::from(r.x.0), place.y as f32 - f32::from(r.y.0));
+        chunk.shown[at] = Shown {
+            d: r.cx.mul_add(x, r.dy.mul_add(y, r.d)),
+            cx: r.cx,
+            dy: r.dy,
+            e: r.ar.mul_add(y, r.e),
+            ar: r.ar,
+            nlo: r.nlo,
+            value: [r.rgb[0], r.rgb[1], r.rgb[2], r.z],
+            index: r.index,
+        };
+        chunk.len = at + 1;
+        let mut left = blocks & self.alive;
+        while left != 0 {
+            let b = left.trailing_zeros() as usize % BLOCKS;
+            chunk.lists[b][usize::from(chunk.lens[b]) % CHUNK] = at as u8;
+            chunk.lens[b] += 1;
+            left &= left - 1;
+        }
+    }
+
+    /// Draws the chunk and empties it.
+    #[inline(always)]
+    fn draw<S: Simd>(&mut self, s: S, shared: &Shared) {
+        let (lane_x, lane_y) = (s.load(&LANE_X), s.load(&LANE_Y));
+        let mut left = self.alive;
+        while left != 0 {
+            let b = left.trailing_zeros() as usize % BLOCKS;
+            left &= left - 1;
+            let list = &self.chunk.lists[b][..usize::from(self.chunk.lens[b]).min(CHUNK)];
+            if list.is_empty() {
                 continue;
             }
-            let middle = u + r.slope * dy;
-            let half = f64::from(left.sqrt() * r.col_width) + MARGIN;
-            let lo = (middle - half).max(first);
-            let hi = (middle + half).min(last);
-            if lo > hi {
-                continue;
-            }
-            for o in lo as usize / LANES..=hi as usize / LANES {
-                let at = row * PER_ROW + o;
-                if !self.alive[at] {
-                    continue;
-                }
-                let offset = ((o * LANES) as f64 - middle) as f32;
-                let weight = update(&mut self.octets[at], r, (offset, base), a_max);
-                if extra.channels > 0 {
-                    let values = &extra.values[r.index as usize * extra.channels..][..extra.channels];
-                    let sums = &mut self.extra[at * LANES * extra.channels..][..LANES * extra.channels];
-                    for (sum, w) in sums.chunks_exact_mut(extra.channels).zip(weight) {
-                        for (s, v) in sum.iter_mut().zip(values) {
-                            *s += w * v;
-                        }
-                    }
-                }
-            }
+            let x = lane_x + s.splat((b % PER_ROW * BLOCK) as f32);
+            let y = lane_y + s.splat((b / PER_ROW * BLOCK) as f32);
+            let extra = &mut self.extra[b * shared.extra.channels..][..shared.extra.channels];
+            let (taken, alive) = take(s, &mut self.blocks[b], (x, y), list, &self.chunk.shown, shared, extra);
+            self.updates += taken as u64;
+            self.alive &= !(u64::from(!alive) << b);
         }
+        self.chunk.len = 0;
+        self.chunk.lens = [0; BLOCKS];
     }
 
     /// T and the sums of red, green, blue, z of a pixel of the tile.
     #[inline]
     pub fn pixel(&self, x: usize, y: usize) -> (f32, [f32; 4]) {
-        let (o, l) = (&self.octets[y * PER_ROW + x / LANES], x % LANES);
-        (o.t[l].abs(), [o.sum[0][l], o.sum[1][l], o.sum[2][l], o.sum[3][l]])
+        let (b, l) = (y / BLOCK * PER_ROW + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
+        let block = &self.blocks[b];
+        (block.t[l].abs(), block.sum.map(|s| s[l]))
     }
 
-    /// The extra sums of the first `width` pixels of a row.
-    pub fn extra_row(&self, y: usize, width: usize, channels: usize) -> &[f32] {
-        &self.extra[y * SIDE * channels..][..width * channels]
+    /// The extra sums of a pixel of the tile.
+    #[inline]
+    pub fn extra(&self, x: usize, y: usize, channels: usize) -> impl Iterator<Item = f32> {
+        let (b, l) = (y / BLOCK * PER_ROW + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
+        self.extra[b * channels..][..channels].iter().map(move |sum| sum[l])
     }
 }
 
-/// One Gaussian on one octet; the weights T alpha. `offset` is the column of lane 0 from the row's
-/// middle, `base` the part of sigma that the row alone gives.
+/// One block takes its list; how many entries it took and whether a pixel is still unfinished.
 #[inline(always)]
-fn update(octet: &mut Octet, r: &Record, (offset, base): (f32, f32), a_max: f32) -> [f32; LANES] {
-    let mut weight = [0.0; LANES];
-    for l in 0..LANES {
-        let d = offset + l as f32;
-        let raw = r.opacity * exp_neg(-(base + r.col_k * (d * d)));
-        let capped = if raw < a_max { raw } else { a_max };
-        let t = octet.t[l];
-        let alpha = if (raw >= ALPHA_CUT) & (t > 0.0) { capped } else { 0.0 };
-        let next = t * (1.0 - alpha);
-        let stop = (next <= T_STOP) & (t > 0.0);
-        weight[l] = if stop { 0.0 } else { alpha * t };
-        octet.t[l] = if stop { -t } else { next };
-    }
-    let values = [r.rgb[0], r.rgb[1], r.rgb[2], r.z];
-    for (sum, value) in octet.sum.iter_mut().zip(values) {
-        for l in 0..LANES {
-            sum[l] += weight[l] * value;
+fn take<S: Simd>(
+    s: S,
+    block: &mut Block,
+    (x, y): (S::V, S::V),
+    list: &[u8],
+    shown: &[Shown; CHUNK],
+    shared: &Shared,
+    extra: &mut [[f32; LANES]],
+) -> (usize, bool) {
+    let (zero, cut, stop, a_max) = (s.splat(0.0), s.splat(X_CUT.next_up()), s.splat(T_STOP), s.splat(shared.a_max));
+    let mut t = s.load(&block.t);
+    let (mut r, mut g) = (s.load(&block.sum[0]), s.load(&block.sum[1]));
+    let (mut b, mut z) = (s.load(&block.sum[2]), s.load(&block.sum[3]));
+    let (mut taken, mut alive) = (list.len(), true);
+    for (n, &i) in list.iter().enumerate() {
+        let o = &shown[usize::from(i)];
+        let d = s.splat(o.cx).mul_add(x, s.splat(o.dy).mul_add(y, s.splat(o.d)));
+        let e = s.splat(o.ar).mul_add(y, s.splat(o.e));
+        let q = d.mul_add(d, e.mul_add(e, s.splat(o.nlo)));
+        let raw = exp2_neg(s, q);
+        let alpha = cut.select_gt(q, a_max.select_gt(raw, raw, a_max), zero);
+        let weight = alpha * t;
+        let next = t - weight;
+        let weight = next.select_gt(stop, weight, zero);
+        let going = next.gt_bits(stop);
+        t = next.select_gt(stop, next, t.abs().negate(u16::MAX));
+        r = weight.mul_add(s.splat(o.value[0]), r);
+        g = weight.mul_add(s.splat(o.value[1]), g);
+        b = weight.mul_add(s.splat(o.value[2]), b);
+        z = weight.mul_add(s.splat(o.value[3]), z);
+        if !extra.is_empty() {
+            let values = &shared.extra.values[o.index as usize * extra.len()..][..extra.len()];
+            for (sum, value) in extra.iter_mut().zip(values) {
+                weight.mul_add(s.splat(*value), s.load(sum)).store(sum);
+            }
+        }
+        if going == 0 {
+            (taken, alive) = (n + 1, false);
+            break;
         }
     }
-    weight
+    t.store(&mut block.t);
+    r.store(&mut block.sum[0]);
+    g.store(&mut block.sum[1]);
+    b.store(&mut block.sum[2]);
+    z.store(&mut block.sum[3]);
+    (taken, alive)
 }

@@ -2,10 +2,10 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | `math.rs` | exp and ln from own polynomials: the same bits on every CPU |
-//! | `project.rs` | Gaussian -> screen [`project::Record`]: culling, covariance, antialiasing |
-//! | `bin.rs` | records -> one list of `depth | record` keys per 32x32 tile |
-//! | `blend.rs` | one tile front to back: lazily sorted keys, rows of 8 pixels |
+//! | `math.rs` | exp2, log2 and ln from own polynomials: the same bits on every CPU |
+//! | `project.rs` | Gaussians -> screen [`project::Record`]s, sixteen at a time: culling, covariance, antialiasing |
+//! | `bin.rs` | records -> one list of `depth, record, blocks` keys per 32x32 tile |
+//! | `blend.rs` | one tile front to back: lazy depth buckets, lists per 4x4 block, state in registers |
 //! | `render.rs` | [`Renderer`]: memory, threads, output images |
 //! | `reference.rs` | the same picture by brute force in f64: the oracle of the tests |
 //!
@@ -20,8 +20,8 @@
 //! D = sum T alpha z                           a pixel stops when the next T <= 1e-4
 //! ```
 //!
-//! The result does not depend on the number of threads or on the CPU: no libm call, no fused
-//! multiply-add, one owner per tile, sort keys without equals.
+//! The result does not depend on the number of threads or on the CPU: no libm call, multiply-adds fused
+//! where the code says so, one owner per tile, sort keys without equals.
 #![deny(unsafe_code)]
 
 pub mod bin;

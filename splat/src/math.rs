@@ -1,31 +1,54 @@
-//! exp and ln from own polynomials, in plain multiplications and additions.
+//! exp2, log2 and ln from own polynomials.
 //!
-//! The system's libm differs between machines; these give the same bits wherever f32 and f64 follow
-//! IEEE 754. Neither fuses a multiplication with an addition.
+//! The system's libm differs between machines; these are made of IEEE operations and explicit fused
+//! multiply-adds, so they give the same bits everywhere.
 
-/// exp(x) for x in -87..=0, relative error below 2e-7; below -87 the value at -87.
+use sf_ops::simd::{LANES, Simd, Vector};
+
+/// 2^-x for x in -0.5..=126; relative error below 4e-7. Outside that range the value is meaningless.
 ///
-/// x = n ln2 + r with |r| <= ln2/2, exp(x) = 2^n exp(r), exp(r) = 1 + r + r^2 q(r) with q the minimax
-/// polynomial of degree 4 for the relative error (3e-9 before rounding).
+/// -x = n - f with |f| <= 1/2, 2^-f by a polynomial of degree 5 that interpolates at the Chebyshev nodes
+/// (1.6e-7 before rounding), 2^n by adding to the exponent.
 #[inline(always)]
-pub fn exp_neg(x: f32) -> f32 {
-    // Adding 1.5 * 2^23 leaves the rounded integer in the low mantissa bits.
+pub fn exp2_neg<S: Simd>(s: S, x: S::V) -> S::V {
+    // 1.5 * 2^23 less x holds the rounded integer in the low mantissa bits.
     const MAGIC: f32 = 12_582_912.0;
-    // ln2 in two parts: the high one has 9 zero bits at its end, so n * LN2_HI is exact.
-    const LN2_HI: f32 = 0.693_359_4;
-    const LN2_LO: f32 = -2.121_944_4e-4;
-    let x = if x > -87.0 { x } else { -87.0 };
-    let shifted = x * std::f32::consts::LOG2_E + MAGIC;
-    let n = shifted - MAGIC;
-    let r = (x - n * LN2_HI) - n * LN2_LO;
-    let q = 1.381_446_7e-3;
-    let q = q * r + 8.368_781e-3;
-    let q = q * r + 4.166_839_3e-2;
-    let q = q * r + 0.166_665_2;
-    let q = q * r + 0.499_999_94;
-    let p = r * r * q + r + 1.0;
-    // n is in -126..=0, so the exponent of p (about 1) stays normal.
-    f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
+    let shifted = s.splat(MAGIC) - x;
+    let f = x + (shifted - s.splat(MAGIC));
+    let p = s.splat(-1.339_086_3e-3);
+    let p = p.mul_add(f, s.splat(9.676_032e-3));
+    let p = p.mul_add(f, s.splat(-5.550_357e-2));
+    let p = p.mul_add(f, s.splat(0.240_221_07));
+    let p = p.mul_add(f, s.splat(-std::f32::consts::LN_2));
+    let p = p.mul_add(f, s.splat(1.0));
+    p * shifted.pow2_of_low_bits(127)
+}
+
+/// log2 of normal positive values, absolute error below 6e-7 for values in 1/255..=1.
+///
+/// x = 2^e m with m in [sqrt(1/2), sqrt(2)), log2 m = (m-1) q(m-1) with q of degree 8 (4e-8 before rounding).
+#[inline(always)]
+pub fn log2<S: Simd>(s: S, x: S::V) -> S::V {
+    let mut bits = [0.0; LANES];
+    x.store(&mut bits);
+    let (mut mantissa, mut exponent) = ([0.0; LANES], [0.0; LANES]);
+    for l in 0..LANES {
+        // 0x3f3504f3 is sqrt(1/2): subtracting it makes the exponent change there.
+        let shifted = bits[l].to_bits().wrapping_sub(0x3f35_04f3);
+        exponent[l] = (shifted as i32 >> 23) as f32;
+        mantissa[l] = f32::from_bits((shifted & 0x007f_ffff) + 0x3f35_04f3);
+    }
+    let t = s.load(&mantissa) - s.splat(1.0);
+    let q = s.splat(0.123_109_68);
+    let q = q.mul_add(t, s.splat(-0.205_861_88));
+    let q = q.mul_add(t, s.splat(0.216_078_22));
+    let q = q.mul_add(t, s.splat(-0.239_169_88));
+    let q = q.mul_add(t, s.splat(0.287_903_25));
+    let q = q.mul_add(t, s.splat(-0.360_693_28));
+    let q = q.mul_add(t, s.splat(0.480_910_75));
+    let q = q.mul_add(t, s.splat(-0.721_347_45));
+    let q = q.mul_add(t, s.splat(std::f32::consts::LOG2_E));
+    q.mul_add(t, s.load(&exponent))
 }
 
 /// ln(x) for a normal positive x, absolute error below 1e-14 times max(1, |ln x|).
@@ -53,18 +76,55 @@ pub fn ln(x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use sf_ops::Kernels;
+    use sf_ops::simd::Body;
+
+    /// One function over a slice of whole vectors.
+    struct Apply<'a>(&'a mut [[f32; LANES]], bool);
+
+    impl Body for Apply<'_> {
+        type Output = ();
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) {
+            for x in self.0 {
+                let v = s.load(x);
+                if self.1 { exp2_neg(s, v).store(x) } else { log2(s, v).store(x) }
+            }
+        }
+    }
+
+    /// Values and results on every instruction set, which must have the same bits.
+    fn apply(values: &[f32], exp2: bool) -> Vec<f32> {
+        let run = |kernels: &Kernels| {
+            let mut x: Vec<[f32; LANES]> = values.chunks_exact(LANES).map(|c| c.try_into().unwrap()).collect();
+            kernels.enter(Apply(&mut x, exp2));
+            x.concat()
+        };
+        let results: Vec<Vec<f32>> = Kernels::available().map(run).collect();
+        assert!(results.iter().all(|r| r.iter().zip(&results[0]).all(|(a, b)| a.to_bits() == b.to_bits())));
+        results.into_iter().next().unwrap()
+    }
 
     #[test]
-    fn exp_is_within_2e_7_of_the_true_value() {
-        let mut worst = 0.0f64;
-        for i in 0..=870_000 {
-            let x = -(i as f32) * 1e-4;
-            let (got, want) = (f64::from(exp_neg(x)), f64::from(x).exp());
-            worst = worst.max((got / want - 1.0).abs());
-        }
-        assert!(worst < 2e-7, "relative error {worst:.2e}");
-        assert_eq!(exp_neg(0.0), 1.0);
-        assert_eq!(exp_neg(-1e30), exp_neg(-87.0));
+    fn exp2_is_within_4e_7_of_the_true_value() {
+        let x: Vec<f32> = (0..880_000).map(|i| i as f32 * 1e-4 - 0.5).collect();
+        let worst = x
+            .iter()
+            .zip(apply(&x, true))
+            .fold(0.0f64, |worst, (x, got)| worst.max((f64::from(got) / (-f64::from(*x)).exp2() - 1.0).abs()));
+        assert!(worst < 4e-7, "relative error {worst:.2e}");
+        assert_eq!(apply(&[0.0; LANES], true), [1.0; LANES]);
+    }
+
+    #[test]
+    fn log2_is_within_6e_7_of_the_true_value() {
+        let x: Vec<f32> = (0..800_000).map(|i| 1.0 / 255.0 + i as f32 * (254.0 / 255.0 / 800_000.0)).collect();
+        let worst = x
+            .iter()
+            .zip(apply(&x, false))
+            .fold(0.0f64, |worst, (x, got)| worst.max((f64::from(got) - f64::from(*x).log2()).abs()));
+        assert!(worst < 6e-7, "absolute error {worst:.2e}");
+        assert_eq!(apply(&[1.0; LANES], false), [0.0; LANES]);
     }
 
     #[test]

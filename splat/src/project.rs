@@ -1,22 +1,31 @@
-//! One Gaussian to the screen.
+//! Gaussians to the screen.
 //!
-//! Everything up to the record is f64: a needle of 1000 x 0.5 pixels has a covariance whose small
-//! eigenvalue is the difference of numbers a million times larger, which f32 does not hold.
-//!
-//! The record keeps the quadratic form as a sum of squares,
+//! The record keeps the quadratic form as a sum of squares in units of powers of two,
 //!
 //! ```text
-//! sigma = row_k dy^2 + col_k (dx - slope dy)^2      row_k = 1 / (2 Syy), slope = Sxy / Syy,
-//!                                                   col_k = Syy / (2 det)
+//! x = d^2 + e^2 + nlo,  alpha = 2^-x
+//! d = cx (X - u) + dy (Y - v)     cx = sqrt(log2(e) Syy / (2 det)),  dy = -cx Sxy / Syy
+//! e = ar (Y - v)                  ar = sqrt(log2(e) / (2 Syy)),      nlo = -log2(opacity)
 //! ```
 //!
-//! which equals (A dx^2 + C dy^2)/2 + B dx dy of the inverse covariance but cannot cancel, is never
-//! negative, and gives the exact run of pixels that a row needs.
+//! which equals opacity exp(-sigma) of the inverse covariance but cannot cancel and is never negative. d and e
+//! are stored at the first pixel of the record's box, so that a centre far outside the image costs no precision.
+//!
+//! Two paths. Means, depths and centres are f64 in both: the order depends on them. The covariance is f32, sixteen
+//! at a time, where that is enough: a trace of at most [`EASY_TRACE`] pixels squared and a determinant that the low-pass
+//! keeps away from zero. Then Cauchy-Binet in f32 has a relative error below 4e-5 in the determinant. Anything
+//! else, and any field that needs a rule (not finite, clamped, denormal), takes [`Projector::project`], which is f64:
+//! a needle of 1000 x 0.5 pixels has a small eigenvalue that is the difference of numbers a million
+//! times larger. The choice is made by bits that are equal everywhere.
+
+use std::ops::Range;
 
 use glam::{DMat3, DVec3};
 use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
+use sf_ops::simd::{Body, LANES, Simd, Vector};
 
+use crate::blend::BLOCK;
 use crate::math;
 
 /// Alphas below this leave no trace: 1/255.
@@ -34,25 +43,30 @@ pub const SCALE_RANGE: (f32, f32) = (1e-20, 1e10);
 /// excludes a pixel that the alpha test would keep.
 pub const MARGIN: f64 = 1e-3;
 
-/// A visible Gaussian on the screen.
+/// log2(255), and a few units in the last place: -log2(alpha) above this leaves no trace.
+pub const X_CUT: f32 = 7.994_354;
+/// Largest trace of a covariance that is computed in f32, pixels squared: a sigma of 100 pixels.
+pub const EASY_TRACE: f32 = 1e4;
+/// Least determinant over trace of a covariance that is computed in f32, pixels squared. A low-pass of eps2d
+/// alone gives eps2d.
+const EASY_RATIO: f32 = 0.02;
+
+/// A visible Gaussian on the screen; one cache line.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(C, align(64))]
 pub struct Record {
-    /// Centre in pixel coordinates.
-    pub u: f64,
-    /// Centre in pixel coordinates.
-    pub v: f64,
-    /// Sxy / Syy: how far the middle of a row moves per row.
-    pub slope: f64,
-    /// 1 / (2 Syy).
-    pub row_k: f64,
-    /// Syy / (2 det S2), 1 / pixels squared.
-    pub col_k: f32,
-    /// 1 / sqrt(col_k).
-    pub col_width: f32,
-    /// ln(255 opacity): sigma above this gives an alpha below 1/255.
-    pub cut: f32,
-    /// Opacity after antialiasing, 1/255..=1.
-    pub opacity: f32,
+    /// d at the centre of pixel `(x.0, y.0)`.
+    pub d: f32,
+    /// Change of d per column.
+    pub cx: f32,
+    /// Change of d per row.
+    pub dy: f32,
+    /// e in row `y.0`.
+    pub e: f32,
+    /// Change of e per row.
+    pub ar: f32,
+    /// -log2(opacity) after antialiasing, 0..=log2(255).
+    pub nlo: f32,
     /// Camera z, the sort key and the depth.
     pub z: f32,
     /// Colour.
@@ -65,7 +79,57 @@ pub struct Record {
     pub y: (u16, u16),
 }
 
+/// Blocks of a tile, first and last of either axis, 0..=7.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Rect {
+    /// Columns of blocks.
+    pub x: (u8, u8),
+    /// Rows of blocks.
+    pub y: (u8, u8),
+}
+
+impl Rect {
+    /// In 12 bits.
+    #[inline(always)]
+    pub fn pack(self) -> u32 {
+        u32::from(self.x.0) | u32::from(self.x.1) << 3 | u32::from(self.y.0) << 6 | u32::from(self.y.1) << 9
+    }
+
+    /// From 12 bits.
+    #[inline(always)]
+    pub fn unpack(bits: u32) -> Rect {
+        let three = |shift: u32| (bits >> shift & 7) as u8;
+        Rect { x: (three(0), three(3)), y: (three(6), three(9)) }
+    }
+
+    /// Bit `8 row + column` set for every block.
+    #[inline(always)]
+    pub fn blocks(self) -> u64 {
+        let columns = (2u64 << self.x.1) - (1 << self.x.0);
+        let rows =
+            (u64::MAX >> (56 - 8 * (self.y.1 - self.y.0) as u32) & 0x0101_0101_0101_0101) << (8 * u32::from(self.y.0));
+        columns * rows
+    }
+}
+
 impl Record {
+    /// The blocks of the tile with first pixel `(x, y)` that the pixel box meets; it must meet the tile.
+    #[inline(always)]
+    pub fn rect(&self, (x, y): (usize, usize)) -> Rect {
+        let span = |(lo, hi): (u16, u16), first: usize| {
+            let lo = usize::from(lo).max(first) - first;
+            let hi = (usize::from(hi) - 1 - first).min(TILE as usize - 1);
+            ((lo / BLOCK) as u8, (hi / BLOCK) as u8)
+        };
+        Rect { x: span(self.x, x), y: span(self.y, y) }
+    }
+
+    /// [`Rect::blocks`] of [`Record::rect`].
+    #[inline(always)]
+    pub fn blocks(&self, tile: (usize, usize)) -> u64 {
+        self.rect(tile).blocks()
+    }
+
     /// Number of tiles that the pixel box meets.
     pub fn tiles(&self) -> u64 {
         let (x, y) = self.tile_box();
@@ -156,7 +220,7 @@ impl Projector {
         }
     }
 
-    /// Gaussian `i` on the screen; `None` when it leaves no trace in the image.
+    /// Gaussian `i` on the screen by the f64 path; `None` when it leaves no trace in the image.
     pub fn project(&self, scene: &Gaussians, i: usize, counts: &mut Counts) -> Option<Record> {
         let (mean, scale, quat) = (scene.mean[i], scene.scale[i], scene.quat[i]);
         let (opacity, rgb) = (scene.opacity[i], scene.colour[i]);
@@ -211,16 +275,17 @@ impl Projector {
         let (u, v) = (k.fx * (p.x / p.z) + k.cx, k.fy * (p.y / p.z) + k.cy);
         let x = pixel_span(u, radius * sxx.sqrt(), self.camera.width)?;
         let y = pixel_span(v, radius * syy.sqrt(), self.camera.height)?;
-        let col_k = 0.5 * syy / det;
+        let half_log2e = 0.5 * std::f64::consts::LOG2_E;
+        let (cx, ar) = ((half_log2e * syy / det).sqrt(), (half_log2e / syy).sqrt());
+        let dy = -cx * (sxy / syy);
+        let (du, dv) = (f64::from(x.0) + 0.5 - u, f64::from(y.0) + 0.5 - v);
         Some(Record {
-            u,
-            v,
-            slope: sxy / syy,
-            row_k: 0.5 / syy,
-            col_k: col_k as f32,
-            col_width: (1.0 / col_k).sqrt() as f32,
-            cut: cut as f32,
-            opacity,
+            d: (cx * du + dy * dv) as f32,
+            cx: cx as f32,
+            dy: dy as f32,
+            e: (ar * dv) as f32,
+            ar: ar as f32,
+            nlo: (-std::f64::consts::LOG2_E * math::ln(f64::from(opacity))) as f32,
             z,
             rgb,
             index: i as u32,
@@ -260,6 +325,267 @@ impl Projector {
             det: minor(0, 1) + minor(0, 2) + minor(1, 2),
         }
     }
+}
+
+/// Projects a run of the scene, sixteen at a time.
+pub struct Project<'a> {
+    /// The camera.
+    pub projector: &'a Projector,
+    /// The scene.
+    pub scene: &'a Gaussians,
+    /// Which part of it.
+    pub run: Range<usize>,
+    /// A further test of a visible Gaussian; those that fail it count as not finite.
+    pub usable: Option<&'a (dyn Fn(usize) -> bool + Sync)>,
+    /// Where visible ones go, in index order.
+    pub records: &'a mut Vec<Record>,
+    /// What was dropped or clamped.
+    pub counts: &'a mut Counts,
+}
+
+impl Body for Project<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Project { projector, scene, run, usable, records, counts } = self;
+        for start in run.clone().step_by(LANES) {
+            let lanes = (run.end - start).min(LANES);
+            let mut rows = [[0.0; LANES]; LANES];
+            for (l, row) in rows.iter_mut().enumerate().take(lanes) {
+                let i = start + l;
+                row[0..3].copy_from_slice(&scene.mean[i]);
+                row[3..6].copy_from_slice(&scene.scale[i]);
+                row[6..10].copy_from_slice(&scene.quat[i]);
+                row[10] = scene.opacity[i];
+                row[11..14].copy_from_slice(&scene.colour[i]);
+            }
+            s.transpose(&mut rows);
+            let (easy, hard) = projector.sixteen(s, &mut rows, start as u32);
+            let valid = (u32::from(u16::MAX) >> (LANES - lanes)) as u16;
+            let mut left = (easy | hard) & valid;
+            if easy & valid != 0 {
+                s.transpose(&mut rows);
+            }
+            while left != 0 {
+                let l = left.trailing_zeros() as usize % LANES;
+                left &= left - 1;
+                let record = if easy >> l & 1 != 0 {
+                    unpack(&rows[l])
+                } else {
+                    let Some(record) = projector.project(scene, start + l, counts) else { continue };
+                    record
+                };
+                if usable.is_some_and(|usable| !usable(start + l)) {
+                    counts.nonfinite += 1;
+                    continue;
+                }
+                records.push(record);
+            }
+        }
+    }
+}
+
+/// A record from its row of the transposed output of [`Projector::sixteen`].
+#[inline(always)]
+fn unpack(row: &[f32; LANES]) -> Record {
+    let pair = |v: f32| (v.to_bits() as u16, (v.to_bits() >> 16) as u16);
+    Record {
+        d: row[0],
+        cx: row[1],
+        dy: row[2],
+        e: row[3],
+        ar: row[4],
+        nlo: row[5],
+        z: row[6],
+        rgb: [row[7], row[8], row[9]],
+        index: row[10].to_bits(),
+        x: pair(row[11]),
+        y: pair(row[12]),
+    }
+}
+
+impl Projector {
+    /// Sixteen Gaussians, field by field: in `rows`, mean 0..3, scale 3..6, quaternion 6..10, opacity, colour 11..14;
+    /// out, the fields of [`unpack`]. Returns the lanes that are visible, and those that need the f64 path.
+    #[inline(always)]
+    fn sixteen<S: Simd>(&self, s: S, rows: &mut [[f32; LANES]; LANES], first: u32) -> (u16, u16) {
+        let (zero, one) = (s.splat(0.0), s.splat(1.0));
+
+        // Fields that need no rule.
+        let scale = [s.load(&rows[3]), s.load(&rows[4]), s.load(&rows[5])];
+        let [w, x, y, z] = [s.load(&rows[6]), s.load(&rows[7]), s.load(&rows[8]), s.load(&rows[9])];
+        let opacity = s.load(&rows[10]);
+        // 0 times a number is 0 unless the number is not finite.
+        let mut unfinite = zero;
+        for i in [0, 1, 2, 11, 12, 13] {
+            unfinite = s.load(&rows[i]).mul_add(zero, unfinite);
+        }
+        let norm2 = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
+        // Squares of tiny ones underflow: below 1e-15 they are lengthened by 2^100 first.
+        let longer = s.splat(1e-30).select_gt(norm2, s.splat(f32::from_bits(227 << 23)), one);
+        let (w, x, y, z) = (w * longer, x * longer, y * longer, z * longer);
+        let norm2 = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
+        let mut plain = one.gt_bits(unfinite.abs()) & norm2.gt_bits(s.splat(1e-30)) & s.splat(1e12).gt_bits(norm2);
+        for v in scale {
+            plain &= v.gt_bits(s.splat(1e-18)) & s.splat(1e9).gt_bits(v);
+        }
+        plain &= opacity.gt_bits(s.splat(-f32::from_bits(1))) & s.splat(1f32.next_up()).gt_bits(opacity);
+
+        // Means in f64; the loops are vectorised by the compiler.
+        let (m, k) = (&self.world_to_camera, &self.camera.k);
+        let mut centre = [[0.0f64; LANES]; 2];
+        let (mut depth, mut inverse, mut ray) = ([0.0f32; LANES], [0.0f32; LANES], [[0.0f32; LANES]; 2]);
+        for l in 0..LANES {
+            let x = f64::from(rows[0][l]) - self.centre.x;
+            let y = f64::from(rows[1][l]) - self.centre.y;
+            let z = f64::from(rows[2][l]) - self.centre.z;
+            let px = m.x_axis.x * x + m.y_axis.x * y + m.z_axis.x * z;
+            let py = m.x_axis.y * x + m.y_axis.y * y + m.z_axis.y * z;
+            let pz = m.x_axis.z * x + m.y_axis.z * y + m.z_axis.z * z;
+            let over_z = 1.0 / pz;
+            let (rx, ry) = (px * over_z, py * over_z);
+            centre[0][l] = k.fx * rx + k.cx;
+            centre[1][l] = k.fy * ry + k.cy;
+            depth[l] = pz as f32;
+            inverse[l] = over_z as f32;
+            ray[0][l] = rx as f32;
+            ray[1][l] = ry as f32;
+        }
+        let depth_v = s.load(&depth);
+        let in_depth =
+            depth_v.gt_bits(s.splat(self.settings.near.next_down())) & s.splat(FAR.next_up()).gt_bits(depth_v);
+        let cut = s.splat(ALPHA_CUT.next_down());
+        let seen = plain & in_depth & opacity.gt_bits(cut);
+        if seen == 0 {
+            return (0, !plain);
+        }
+
+        // Rows of J R^T, world axes: f/z (row 0 or 1 of R^T - ray row 2 of R^T).
+        let ray = [clamp(s.load(&ray[0]), s, self.clamp_x), clamp(s.load(&ray[1]), s, self.clamp_y)];
+        let over_z = s.load(&inverse);
+        let (fx, fy) = (s.splat(k.fx as f32) * over_z, s.splat(k.fy as f32) * over_z);
+        let (mut jx, mut jy) = ([zero; 3], [zero; 3]);
+        let (right, down, forward) = (m.row(0), m.row(1), m.row(2));
+        for j in 0..3 {
+            let toward = s.splat(forward[j] as f32);
+            jx[j] = fx * (s.splat(right[j] as f32) - ray[0] * toward);
+            jy[j] = fy * (s.splat(down[j] as f32) - ray[1] * toward);
+        }
+        // Columns of Q from a quaternion of any length.
+        let two = s.splat(2.0) / norm2;
+        let (tx, ty, tz) = (two * x, two * y, two * z);
+        let (xx, yy, zz) = (tx * x, ty * y, tz * z);
+        let (xy, xz, yz) = (tx * y, tx * z, ty * z);
+        let (wx, wy, wz) = (tx * w, ty * w, tz * w);
+        let columns = [
+            [one - (yy + zz), xy + wz, xz - wy],
+            [xy - wz, one - (xx + zz), yz + wx],
+            [xz + wy, yz - wx, one - (xx + yy)],
+        ];
+        let (mut a, mut b) = ([zero; 3], [zero; 3]);
+        for i in 0..3 {
+            a[i] = dot(&jx, &columns[i]) * scale[i];
+            b[i] = dot(&jy, &columns[i]) * scale[i];
+        }
+        let (sxx, sxy, syy) = (dot(&a, &a), dot(&a, &b), dot(&b, &b));
+        let minors = [a[0] * b[1] - a[1] * b[0], a[0] * b[2] - a[2] * b[0], a[1] * b[2] - a[2] * b[1]];
+        let before = dot(&minors, &minors);
+        let eps = s.splat(self.settings.eps2d);
+        let det = before + eps * (sxx + syy + eps);
+        let (sxx, syy) = (sxx + eps, syy + eps);
+        let trace = sxx + syy;
+        let soft = s.splat(EASY_TRACE).gt_bits(trace) & det.gt_bits(s.splat(EASY_RATIO) * trace);
+
+        let opacity = if self.settings.aa {
+            opacity * (before / det).max(s.splat((AA_FLOOR * AA_FLOOR) as f32)).sqrt()
+        } else {
+            opacity
+        };
+        let kept = opacity.gt_bits(cut);
+        let log2 = math::log2(s, opacity);
+        // radius^2 = 2 ln(255 opacity) and the margin.
+        let over_cut = (log2 + s.splat(X_CUT)).max(zero);
+        let radius2 = over_cut.mul_add(s.splat((2.0 * std::f64::consts::LN_2) as f32), s.splat(MARGIN as f32));
+        let (mut lo, mut hi) = ([[0.0f32; LANES]; 2], [[0.0f32; LANES]; 2]);
+        let mut inside = u16::MAX;
+        for (i, (variance, size)) in [(sxx, self.camera.width), (syy, self.camera.height)].into_iter().enumerate() {
+            let half = (radius2 * variance).sqrt() + s.splat((0.5 + MARGIN) as f32);
+            let mut middle = [0.0f32; LANES];
+            for l in 0..LANES {
+                middle[l] = centre[i][l] as f32;
+            }
+            let (middle, size) = (s.load(&middle), s.splat(size as f32));
+            // floor(v) + 1 = ceil(v) but for whole numbers, which the margin makes immaterial.
+            let first = ceil(s, at_most((middle - half).max(zero), size));
+            let past = ceil(s, at_most((middle + half - one).max(zero), size));
+            inside &= past.gt_bits(first);
+            first.store(&mut lo[i]);
+            past.store(&mut hi[i]);
+        }
+        let easy = seen & soft & kept & inside;
+        let hard = !plain | seen & !soft;
+        if easy == 0 {
+            return (0, hard);
+        }
+
+        let half_log2e = s.splat((0.5 * std::f64::consts::LOG2_E) as f32);
+        let cx = (half_log2e * syy / det).sqrt();
+        let ar = (half_log2e / syy).sqrt();
+        let dy = zero - cx * (sxy / syy);
+        let mut offset = [[0.0f32; LANES]; 2];
+        let mut boxes = [[0.0f32; LANES]; 2];
+        for i in 0..2 {
+            for l in 0..LANES {
+                offset[i][l] = (f64::from(lo[i][l]) + 0.5 - centre[i][l]) as f32;
+                // 2^23 plus a small whole number holds it in the low bits.
+                let bits = |v: f32| (v + 8_388_608.0).to_bits();
+                boxes[i][l] = f32::from_bits(bits(lo[i][l]) & 0xffff | bits(hi[i][l]) << 16);
+            }
+        }
+        let (du, dv) = (s.load(&offset[0]), s.load(&offset[1]));
+        let colour = [rows[11], rows[12], rows[13]];
+        cx.mul_add(du, dy * dv).store(&mut rows[0]);
+        cx.store(&mut rows[1]);
+        dy.store(&mut rows[2]);
+        (ar * dv).store(&mut rows[3]);
+        ar.store(&mut rows[4]);
+        (zero - log2).store(&mut rows[5]);
+        rows[6] = depth;
+        rows[7..10].copy_from_slice(&colour);
+        for l in 0..LANES {
+            rows[10][l] = f32::from_bits(first + l as u32);
+        }
+        rows[11] = boxes[0];
+        rows[12] = boxes[1];
+        (easy, hard)
+    }
+}
+
+/// x within limits.
+#[inline(always)]
+fn clamp<S: Simd>(x: S::V, s: S, (lo, hi): (f64, f64)) -> S::V {
+    at_most(x.max(s.splat(lo as f32)), s.splat(hi as f32))
+}
+
+/// Sum of products.
+#[inline(always)]
+fn dot<V: Vector>(a: &[V; 3], b: &[V; 3]) -> V {
+    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
+}
+
+/// a < b ? a : b.
+#[inline(always)]
+fn at_most<V: Vector>(a: V, b: V) -> V {
+    b.select_gt(a, a, b)
+}
+
+/// Smallest whole number not below x, for 0 <= x < 2^22.
+#[inline(always)]
+fn ceil<S: Simd>(s: S, x: S::V) -> S::V {
+    let magic = s.splat(12_582_912.0);
+    let near = (x + magic) - magic;
+    x.select_gt(near, near + s.splat(1.0), near)
 }
 
 /// Symmetric 2x2 matrix with its determinant, pixels squared.
@@ -315,9 +641,12 @@ mod tests {
         };
         let mut counts = Counts::default();
         let r = Projector::new(&camera, &SplatSettings::default()).project(&scene, 0, &mut counts).unwrap();
-        assert_eq!((r.u, r.v, r.z), (32.0, 24.0, 4.0));
-        assert!((r.row_k - 0.5 / 25.3).abs() < 1e-9 && (f64::from(r.col_k) - 0.5 / 25.3).abs() < 1e-8);
-        assert!(r.slope.abs() < 1e-9);
+        let unit = (0.5 * std::f64::consts::LOG2_E / 25.3).sqrt() as f32;
+        assert_eq!((r.z, r.nlo), (4.0, 0.0));
+        assert!((r.cx - unit).abs() < 1e-7 && (r.ar - unit).abs() < 1e-7 && r.dy.abs() < 1e-7);
+        assert!(
+            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6 && (r.e - unit * (f32::from(r.y.0) + 0.5 - 24.0)).abs() < 1e-6
+        );
         // Radius sqrt(2 ln 255) * sqrt(25.3) = 16.74 pixels: centres 15.5..=48.5.
         assert_eq!(r.x, (15, 49));
         assert_eq!(counts, Counts::default());

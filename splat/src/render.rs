@@ -3,14 +3,16 @@
 //! Three parallel steps with a barrier each: project (16 runs of the scene), bin (the same runs), blend
 //! (tiles). A tile is owned by one thread and written to the image by it.
 
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard};
 
 use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
+use sf_ops::Kernels;
 use sf_ops::par::Pool;
 
-use crate::bin::{self, GROUPS, Group};
-use crate::blend::{Channels, Place, Tile};
+use crate::bin::{self, GROUPS, Group, KeyForm};
+use crate::blend::{Blend, Channels, Place, Shared, Tile};
 use crate::project::{self, Counts, Projector, TILE};
 
 /// Further values per Gaussian, composited like colour but without a background: velocity, dynamic
@@ -50,6 +52,8 @@ pub struct Stats {
     pub visible: u64,
     /// Pairs of a visible Gaussian and a 32x32 tile.
     pub entries: u64,
+    /// Pairs of a Gaussian and a 4x4 block with an unfinished pixel that were composited.
+    pub block_updates: u64,
     /// Dropped: NaN or infinity in a field.
     pub dropped_nonfinite: u64,
     /// Dropped: negative scale.
@@ -133,6 +137,7 @@ pub fn render(
 #[derive(Debug)]
 pub struct Renderer {
     pool: Arc<Pool>,
+    kernels: &'static Kernels,
     groups: [RwLock<Group>; GROUPS],
     tiles: Vec<Mutex<Tile>>,
 }
@@ -142,6 +147,9 @@ impl Renderer {
     ///
     /// # Errors
     /// Status 5 when the system refuses a thread.
+    ///
+    /// # Panics
+    /// As [`Renderer::with_pool`].
     pub fn new(threads: usize) -> Result<Renderer> {
         let pool = Pool::new(threads.max(1))
             .map_err(|e| Error::resource("render", format!("cannot start {threads} threads: {e}")))?;
@@ -149,8 +157,17 @@ impl Renderer {
     }
 
     /// A renderer on threads that others use too.
+    ///
+    /// # Panics
+    /// As [`Kernels::best`], when the variable that caps the instruction set is unusable.
     pub fn with_pool(pool: Arc<Pool>) -> Renderer {
+        Renderer::with_kernels(pool, Kernels::best())
+    }
+
+    /// A renderer on given threads and a given instruction set; the picture has the same bits on all.
+    pub fn with_kernels(pool: Arc<Pool>, kernels: &'static Kernels) -> Renderer {
         Renderer {
+            kernels,
             groups: std::array::from_fn(|_| RwLock::default()),
             tiles: (0..pool.threads()).map(|_| Mutex::default()).collect(),
             pool,
@@ -206,18 +223,23 @@ impl Renderer {
         }
         out.resize(camera.width as usize, camera.height as usize, extra.channels)?;
         out.stats = stats;
+        let form = KeyForm::of(scene.len());
         let groups = &self.groups;
-        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(g, (columns, rows)));
-        self.blend((columns, rows), (settings.a_max, options.background), extra, out);
+        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(g, form, (columns, rows)));
+        let groups: [_; GROUPS] = std::array::from_fn(|g| read(&groups[g]));
+        let records = std::array::from_fn(|g| &groups[g].records[..]);
+        let shared = Shared { records, form, a_max: settings.a_max, extra };
+        out.stats.block_updates = self.blend(columns as usize, &groups, &shared, options.background, out);
         Ok(())
     }
 
     /// Projects all groups and sums their counts.
     fn project(&mut self, scene: &Gaussians, projector: &Projector, extra: Channels) -> Stats {
-        let usable = |i: usize| extra.values[i * extra.channels..][..extra.channels].iter().all(|v| v.is_finite());
-        let groups = &self.groups;
+        let finite = |i: usize| extra.values[i * extra.channels..][..extra.channels].iter().all(|v| v.is_finite());
+        let usable = (extra.channels > 0).then_some(&finite as &(dyn Fn(usize) -> bool + Sync));
+        let (groups, kernels) = (&self.groups, self.kernels);
         self.pool.run(GROUPS, &|g, _| {
-            write(&groups[g]).project(projector, scene, bin::run(scene.len(), g), &usable);
+            write(&groups[g]).project(kernels, projector, scene, bin::run(scene.len(), g), usable);
         });
         let mut counts = Counts::default();
         let mut stats = Stats { gaussians: scene.len() as u64, ..Stats::default() };
@@ -238,32 +260,36 @@ impl Renderer {
         }
     }
 
-    /// Blends all tiles into the image.
+    /// Blends all tiles into the image; the block updates.
     fn blend(
         &self,
-        (columns, rows): (u32, u32),
-        (a_max, background): (f32, [f32; 3]),
-        extra: Channels,
+        columns: usize,
+        groups: &[RwLockReadGuard<Group>; GROUPS],
+        shared: &Shared,
+        background: [f32; 3],
         out: &mut Rendered,
-    ) {
+    ) -> u64 {
         let (width, height, channels) = (out.width, out.height, out.channels);
         let side = TILE as usize;
+        let rows = height.div_ceil(side);
         // Tiles of one row of tiles share a band of the image; each writes its columns under the lock.
         let band = |planes: usize| (side * width * planes).max(1);
-        let mut extra_bands = out.extra.chunks_mut(band(channels));
-        let bands: Vec<Mutex<Band>> = out
-            .rgb
-            .chunks_mut(band(3))
-            .zip(out.depth.chunks_mut(band(1)))
-            .zip(out.alpha.chunks_mut(band(1)))
-            .map(|((rgb, depth), alpha)| {
-                Mutex::new(Band { rgb, depth, alpha, extra: extra_bands.next().unwrap_or_default() })
+        let mut rgb = out.rgb.chunks_mut(band(3));
+        let mut depth = out.depth.chunks_mut(band(1));
+        let mut alpha = out.alpha.chunks_mut(band(1));
+        let mut extra = out.extra.chunks_mut(band(channels));
+        let bands: [Mutex<Band>; MAX_BANDS] = std::array::from_fn(|_| {
+            Mutex::new(Band {
+                rgb: rgb.next().unwrap_or_default(),
+                depth: depth.next().unwrap_or_default(),
+                alpha: alpha.next().unwrap_or_default(),
+                extra: extra.next().unwrap_or_default(),
             })
-            .collect();
-        self.pool.run((columns * rows) as usize, &|t, worker| {
-            let groups: [RwLockReadGuard<Group>; GROUPS] = std::array::from_fn(|g| read(&self.groups[g]));
+        });
+        let updates = AtomicU64::new(0);
+        self.pool.run(columns * rows, &|t, worker| {
             let mut tile = lock(&self.tiles[worker]);
-            let (tx, ty) = (t % columns as usize, t / columns as usize);
+            let (tx, ty) = (t % columns, t / columns);
             let place = Place {
                 x: tx * side,
                 y: ty * side,
@@ -271,17 +297,19 @@ impl Renderer {
                 height: side.min(height - ty * side),
             };
             tile.clear(place, channels);
-            for group in &groups {
+            for group in groups {
                 tile.push(group.tile(t));
             }
-            tile.blend(place, a_max, extra, |key| {
-                let (group, record) = bin::locate(key);
-                &groups[group].records[record]
-            });
+            self.kernels.enter(Blend { tile: &mut tile, place, shared });
+            updates.fetch_add(tile.updates(), Relaxed);
             lock(&bands[ty]).store(&tile, place, (width, channels), background);
         });
+        updates.into_inner()
     }
 }
+
+/// Rows of tiles of the highest image.
+const MAX_BANDS: usize = Camera::MAX_SIDE.div_ceil(TILE) as usize;
 
 /// The part of every image that one row of tiles covers.
 struct Band<'a> {
@@ -303,9 +331,9 @@ impl Band<'_> {
                 }
                 self.depth[row + x] = z;
                 self.alpha[row + x] = 1.0 - t;
+                let sums = tile.extra(x, y, channels);
+                self.extra[(row + x) * channels..][..channels].iter_mut().zip(sums).for_each(|(v, sum)| *v = sum);
             }
-            let values = tile.extra_row(y, place.width, channels);
-            self.extra[row * channels..][..values.len()].copy_from_slice(values);
         }
     }
 }
