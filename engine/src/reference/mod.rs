@@ -2,8 +2,9 @@
 //! dispatch, weights straight from a checkpoint.
 //!
 //! This is the definition that the fast path is judged against, and it is judged itself against the
-//! PyTorch model's golden tensors. It shares with the fast path only the geometry after the heads
-//! (rotation, intrinsics, activation maps), which is scalar code already.
+//! PyTorch model's golden tensors. It shares with the fast path only what is scalar code already: sizes and
+//! the order of layers, embeddings and position tables, and the geometry after the heads (rotation,
+//! intrinsics, activation maps).
 //!
 //! | file | what |
 //! |---|---|
