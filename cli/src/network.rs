@@ -4,8 +4,8 @@ use crate::progress::Progress;
 use clap::ValueEnum;
 use sf_formats::checkpoint::{Checkpoint, CheckpointTensor};
 use sf_formats::error::escape_path;
+use sf_formats::open::read_regular;
 use sf_formats::{Error, ModelConfig, Result};
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Longest configuration file that is read; a complete one has some 4 kB.
@@ -80,17 +80,8 @@ pub(crate) fn read_config(path: &Path) -> Result<ModelConfig> {
 
 /// A small text file of at most `cap` bytes.
 pub(crate) fn read_text(path: &Path, cap: u64) -> Result<String> {
-    let fault = |e: &std::io::Error| Error::io(path, "read", e);
-    // Looking before opening: an open of a pipe without a writer would block.
-    if !std::fs::metadata(path).map_err(|e| fault(&e))?.is_file() {
-        return Err(fault(&std::io::Error::other("it is not a regular file")));
-    }
-    let mut bytes = Vec::new();
-    let file = std::fs::File::open(path).map_err(|e| fault(&e))?;
-    file.take(cap + 1).read_to_end(&mut bytes).map_err(|e| fault(&e))?;
-    if bytes.len() as u64 > cap {
-        return Err(Error::input(escape_path(path), format!("longer than {cap} bytes: not such a file")));
-    }
+    let bytes = read_regular(path, cap)?
+        .ok_or_else(|| Error::input(escape_path(path), format!("longer than {cap} bytes: not such a file")))?;
     String::from_utf8(bytes).map_err(|_| Error::input(escape_path(path), "is not UTF-8 text"))
 }
 

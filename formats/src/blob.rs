@@ -11,8 +11,9 @@ pub use crate::blob_layout::{Dtype, Layout};
 use crate::config::ModelConfig;
 use crate::digest::{Digest, hex};
 use crate::error::{Error, Result, escape_path};
-use crate::map::{self, Identity};
+use crate::map;
 use crate::meta::Meta;
+use crate::open::{Identity, open_regular};
 use crate::panel::Order;
 use half::f16;
 use std::fs::File;
@@ -69,7 +70,7 @@ impl Blob {
     pub fn open(path: impl AsRef<Path>, mode: LoadMode, verify: Verify) -> Result<Blob> {
         let path = path.as_ref();
         let at = escape_path(path);
-        let (file, identity) = map::open_regular(path)?;
+        let (file, identity) = open_regular(path)?;
         let mut head = [0; HEADER];
         let filled = read_head(&file, &mut head).map_err(|e| Error::io(path, "read", &e))?;
         blob_check::check_header(&head[..filled], identity.bytes(), &at)?;

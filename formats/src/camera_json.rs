@@ -12,7 +12,7 @@
 use crate::atomic::{self, Overwrite};
 use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result, escape, escape_path};
-use crate::sniff::read_regular;
+use crate::open::read_regular;
 use crate::transforms::{Lens, read_matrix};
 use serde_json::{Map, Value, json};
 use std::path::Path;

@@ -6,7 +6,8 @@
 //! executed.
 
 use crate::error::{Error, Result, escape, escape_path};
-use crate::sniff::{FileKind, read_regular};
+use crate::open::read_regular;
+use crate::sniff::FileKind;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

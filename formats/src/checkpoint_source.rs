@@ -1,7 +1,7 @@
 //! [`Checkpoint`]: a source of named tensors, whatever its format; and what every format needs to be one.
 
 use crate::error::{Error, Result};
-use crate::sniff::open_regular;
+use crate::open::open_regular;
 use sha2::{Digest, Sha256};
 use std::io::Read;
 use std::path::Path;

@@ -9,7 +9,8 @@
 
 use crate::atomic::{self, Overwrite};
 use crate::error::{Error, Result, escape, escape_path};
-use crate::sniff::{FileKind, read_regular};
+use crate::open::read_regular;
+use crate::sniff::FileKind;
 use image::codecs::{jpeg, png};
 use image::metadata::Orientation as Exif;
 use image::{ColorType, DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, RgbImage};

@@ -13,13 +13,16 @@
 //! | `meta.rs` | [`Meta`]: typed metadata of a blob |
 //! | `panel.rs` | order of a matrix's weights in a blob |
 //! | `digest.rs` | SHA-256 |
-//! | `map.rs` | opening files safely; the one memory mapping |
+//! | `open.rs` | opening and reading regular files safely |
+//! | `map.rs` | the one memory mapping |
 //! | `atomic.rs` | whole-or-nothing writing: temporary file, then rename |
 //! | `camera.rs` | [`Pose`], [`Intrinsics`], [`Camera`] |
 //! | `checkpoint.rs` | [`checkpoint::open`]: training checkpoints, read tensor by tensor |
 //! | `checkpoint_source.rs` | [`checkpoint::Checkpoint`]: what every checkpoint format gives |
 //! | `safetensors_in.rs`, `torch_in.rs` | the two formats |
-//! | `clip.rs`, `truth.rs`, `transforms.rs` | [`clip::Clip`]: frames, times, reference poses, ground truth |
+//! | `clip.rs` | [`clip::Clip`]: frames, times, intrinsics, reference poses |
+//! | `clip_source.rs`, `transforms.rs` | what a path holds: folders, lists, `transforms.json` |
+//! | `truth.rs` | [`clip::GroundTruth`]; clips as folders with it |
 //! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
 //! | `picture.rs` | depth, velocity and other numbers as pictures with a known scale |
 //! | `scene_io.rs`, `ply.rs` | [`Scene::save`], [`Scene::load`]; splats as PLY and PLY sequences |
@@ -42,6 +45,7 @@ pub mod camera_json;
 pub mod checkpoint;
 mod checkpoint_source;
 pub mod clip;
+mod clip_source;
 pub mod config;
 mod config_check;
 pub mod digest;
@@ -51,6 +55,7 @@ mod json;
 mod map;
 pub mod meta;
 pub mod npy;
+pub mod open;
 pub mod panel;
 pub mod picture;
 pub mod ply;

@@ -7,7 +7,7 @@
 
 use crate::atomic::{AtomicFile, Overwrite};
 use crate::error::{Error, Result, escape, escape_path};
-use crate::sniff::read_regular;
+use crate::open::read_regular;
 use std::path::Path;
 
 /// Longest array file that is read: 8 GiB.

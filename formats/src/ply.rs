@@ -10,9 +10,9 @@
 
 use crate::atomic::{AtomicFile, Overwrite};
 use crate::error::{Error, Result, escape, escape_path};
+use crate::open::open_regular;
 use crate::real::{exp, ln};
 use crate::scene::{Compose, Gaussians, Scene};
-use crate::sniff::open_regular;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
@@ -339,7 +339,8 @@ fn read_header(reader: &mut impl BufRead, file_len: u64, at: &str) -> Result<Lay
 /// Reads splats from a file: ours, or any INRIA file. `frames` is the number of source frames that
 /// exist, if known.
 pub(crate) fn read(path: &Path, frames: Option<usize>) -> Result<(Splats, LoadReport)> {
-    let (file, length) = open_regular(path)?;
+    let (file, identity) = open_regular(path)?;
+    let length = identity.bytes();
     read_from(BufReader::with_capacity(1 << 16, file), length, &escape_path(path), frames)
 }
 

@@ -7,7 +7,7 @@
 
 use crate::checkpoint_source::{Checkpoint, CheckpointTensor, SourceDtype, decode_f32, file_digest};
 use crate::error::{Error, Result, escape, escape_path};
-use crate::sniff::open_regular;
+use crate::open::open_regular;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -61,7 +61,8 @@ fn dtype(name: &str) -> Option<(SourceDtype, u64)> {
 impl Safetensors {
     /// Opens a file and checks its whole header; no tensor is read.
     pub fn open(path: &Path) -> Result<Safetensors> {
-        let (file, length) = open_regular(path)?;
+        let (file, identity) = open_regular(path)?;
+        let length = identity.bytes();
         let at = escape_path(path);
         let fault = |why: String| Error::model(&at, why);
         if length < 10 {

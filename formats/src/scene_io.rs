@@ -8,9 +8,9 @@ use crate::atomic::{self, Overwrite};
 use crate::camera_json::{number, read_camera, size, write_camera};
 use crate::config::{Setting, Value as Config};
 use crate::error::{Error, Result, escape, escape_path};
+use crate::open::read_regular;
 use crate::ply::{self, LoadReport};
 use crate::scene::{Compose, Scene, SceneFrame, SplatSettings};
-use crate::sniff::read_regular;
 use serde_json::{Map, Value, json};
 use std::path::Path;
 

@@ -1,7 +1,7 @@
 //! Which kind of file this is, by its content: a wrong file is named in the message.
 
 use crate::error::{Error, Result};
-use std::fs::File;
+use crate::open::open_regular;
 use std::io::Read;
 use std::path::Path;
 
@@ -120,24 +120,6 @@ impl FileKind {
         file.take(264).read_to_end(&mut head).map_err(|e| Error::io(path, "read", &e))?;
         Ok(FileKind::of_bytes(&head))
     }
-}
-
-/// Opens a regular file for reading and gives its length; folders, pipes and devices are refused.
-pub(crate) fn open_regular(path: &Path) -> Result<(File, u64)> {
-    let (file, identity) = crate::map::open_regular(path)?;
-    Ok((file, identity.bytes()))
-}
-
-/// A whole regular file in memory, read once; longer than `cap` bytes gives `None`.
-pub(crate) fn read_regular(path: &Path, cap: u64) -> Result<Option<Vec<u8>>> {
-    let (file, length) = open_regular(path)?;
-    if length > cap {
-        return Ok(None);
-    }
-    let mut bytes = Vec::with_capacity(length as usize);
-    // The file may have grown since: one byte more than the cap tells.
-    file.take(cap + 1).read_to_end(&mut bytes).map_err(|e| Error::io(path, "read", &e))?;
-    Ok((bytes.len() as u64 <= cap).then_some(bytes))
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@
 
 use crate::camera::{Camera, Intrinsics, Pose};
 use crate::error::{Error, Result, escape, escape_path};
-use crate::sniff::read_regular;
+use crate::open::read_regular;
 use glam::{DMat3, DVec3};
 use serde_json::{Map, Value, json};
 use std::path::{Component, Path, PathBuf};
