@@ -5,15 +5,18 @@
 //! | `metrics.rs` | PSNR, depth, velocity, masks, poses: plain functions of arrays |
 //! | `ssim.rs` | structural similarity as scikit-image's default |
 //! | `align.rs` | the similarity transform between two sets of poses |
-//! | `protocol.rs` | [`Protocol`] and [`evaluate`]: which frames are context, which are tested, how |
+//! | `protocol.rs` | [`Protocol`]: which frames are context, which are tested, with which cameras |
+//! | `evaluate.rs` | [`evaluate()`]: the measurement of a scene on them |
 //! | `report.rs` | [`EvalReport`]: means per method and part, as JSON and as a Markdown table |
 #![deny(unsafe_code)]
 
 pub mod align;
+pub mod evaluate;
 pub mod metrics;
 pub mod protocol;
 pub mod report;
 pub mod ssim;
 
-pub use protocol::{EvalClip, EvalFrame, EvalOptions, Protocol, TargetPoses, evaluate};
+pub use evaluate::evaluate;
+pub use protocol::{EvalClip, EvalFrame, EvalOptions, Protocol, TargetPoses};
 pub use report::{EvalReport, Method, Metric, Part, Scores};
