@@ -3,7 +3,8 @@
 //! | file | what |
 //! |---|---|
 //! | `args.rs` | flag groups and value parsers that verbs share |
-//! | `output.rs` | results, remarks, output folders that appear whole |
+//! | `output.rs` | results, remarks, numbers for people |
+//! | `folder.rs` | output folders that appear whole |
 //! | `progress.rs` | progress bars, on a terminal only |
 //! | `exit.rs` | one-line errors, exit codes, caught panics |
 //! | `network.rs` | presets, configuration files, checkpoints with a progress bar |
@@ -17,6 +18,7 @@
 
 mod args;
 mod exit;
+mod folder;
 mod model;
 mod network;
 mod output;

@@ -12,7 +12,7 @@
 //! DIR/dynamic.npy, dynamic/*.png     [N, H, W] dynamic probability
 //! ```
 
-use crate::output::OutputFolder;
+use crate::folder::OutputFolder;
 use clap::ValueEnum;
 use sf_formats::atomic::Overwrite;
 use sf_formats::clip::TruthFrame;

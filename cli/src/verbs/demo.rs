@@ -16,8 +16,9 @@
 //! ```
 
 use crate::args::{EngineArgs, FolderArgs, Precision, Shift, path_json};
+use crate::folder::OutputFolder;
 use crate::model;
-use crate::output::{Console, OutputFolder, files_json, human_count, json_text};
+use crate::output::{Console, files_json, human_count, json_text};
 use crate::reconstruct;
 use crate::results::Results;
 use crate::views::{self, Rig};

@@ -1,7 +1,8 @@
 //! `export`: a scene as files that other tools open.
 
 use crate::args::{FolderArgs, Times, path_json};
-use crate::output::{Console, OutputFolder, files_json, human_bytes};
+use crate::folder::OutputFolder;
+use crate::output::{Console, files_json, human_bytes};
 use crate::signals;
 use clap::ValueEnum;
 use serde_json::json;

@@ -9,7 +9,8 @@
 //! ```
 
 use crate::args::{FolderArgs, Picture, Shift, Size, Times, path_json};
-use crate::output::{Console, OutputFolder, files_json};
+use crate::folder::OutputFolder;
+use crate::output::{Console, files_json};
 use crate::views::{self, Rig};
 use clap::ValueEnum;
 use serde_json::json;

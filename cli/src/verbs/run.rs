@@ -1,8 +1,9 @@
 //! `run`: a clip of pictures to a scene. Writes `DIR/run.json`, the report, and the files of [`crate::results`].
 
 use crate::args::{ClipArgs, EngineArgs, FolderArgs, Precision, Size, path_json};
+use crate::folder::OutputFolder;
 use crate::model;
-use crate::output::{Console, OutputFolder, files_json, human_count, json_text};
+use crate::output::{Console, files_json, human_count, json_text};
 use crate::reconstruct;
 use crate::results::{DEPTH_STEPS, Emit, Results};
 use clap::ValueEnum;

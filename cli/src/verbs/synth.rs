@@ -2,7 +2,8 @@
 //! binary stream on standard output for a trainer (layout: `synth/src/stream.rs`).
 
 use crate::args::{FolderArgs, Size, path_json};
-use crate::output::{Console, OutputFolder, Stdout, files_json};
+use crate::folder::OutputFolder;
+use crate::output::{Console, Stdout, files_json};
 use clap::ValueEnum;
 use serde_json::json;
 use sf_formats::atomic::Overwrite;
