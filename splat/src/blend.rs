@@ -17,12 +17,10 @@ use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::{self, KeyForm};
 use crate::math::exp2_neg;
-use crate::project::{Record, TILE, X_CUT};
+use crate::project::{BLOCK, Record, TILE, X_CUT};
 
 /// A pixel is finished when its next T would be at or below this.
 pub const T_STOP: f32 = 1e-4;
-/// Side of a block in pixels.
-pub const BLOCK: usize = 4;
 const SIDE: usize = TILE as usize;
 /// Blocks in a row of a tile.
 const PER_ROW: usize = SIDE / BLOCK;

@@ -25,7 +25,6 @@ use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
 use sf_ops::simd::{Body, LANES, Simd, Vector};
 
-use crate::blend::BLOCK;
 use crate::math;
 
 /// Alphas below this leave no trace: 1/255.
@@ -36,6 +35,8 @@ pub const FAR: f32 = 1e10;
 pub const AA_FLOOR: f64 = 0.005;
 /// Side of a tile in pixels.
 pub const TILE: u32 = 32;
+/// Side of a block in pixels.
+pub const BLOCK: usize = 4;
 /// Standard deviations are clamped to this range, scene units. The low end keeps a zero scale a point;
 /// the high end keeps the fourth powers in the determinant finite.
 pub const SCALE_RANGE: (f32, f32) = (1e-20, 1e10);
