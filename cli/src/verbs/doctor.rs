@@ -6,7 +6,9 @@ use serde_json::{Value, json};
 use sf_formats::Result;
 use sf_ops::Kernels;
 use sf_ops::cpu::Isa;
+use sf_ops::peak;
 use std::fs;
+use std::time::Duration;
 
 /// What to describe.
 #[derive(clap::Args)]
@@ -16,12 +18,16 @@ pub(crate) struct Args {
     isa: Option<Isa>,
 }
 
+/// Time of each peak probe: long enough for a core to reach its clock, short enough to wait for.
+const PROBE: Duration = Duration::from_millis(200);
+
 /// Name and kernels of one instruction set.
 fn kernels_json(k: &Kernels) -> Value {
     json!({
         "isa": k.isa.name(),
         "gemm_f32": k.gemm_f32.name,
         "gemm_f16": k.gemm_f16.name,
+        "gemm_s8": k.gemm_s8.name,
         "vector": k.vector.name,
     })
 }
@@ -70,6 +76,7 @@ impl Machine {
 pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let chosen = args::kernels(args.isa)?;
     let m = Machine::probe();
+    let (f32_peak, s8_peak) = (peak::flops_per_second(chosen, PROBE), peak::s8_ops_per_second(chosen, PROBE));
     let json = json!({
         "schema": "streetforward.doctor/1",
         "version": env!("CARGO_PKG_VERSION"),
@@ -83,6 +90,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         "memory_limit_bytes": m.memory_limit_bytes,
         "governor": m.governor,
         "kernels": kernels_json(chosen),
+        "peak_f32_gflops_per_core": f32_peak / 1e9,
+        "peak_s8_gops_per_core": s8_peak / 1e9,
         "available": Kernels::available().map(kernels_json).collect::<Value>(),
     });
     let size = |n: Option<u64>| n.map_or_else(|| "unknown".into(), human_bytes);
@@ -102,7 +111,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     row("governor", m.governor.unwrap_or_else(|| "unknown".into()));
     let names: Vec<&str> = Kernels::available().map(|k| k.isa.name()).collect();
     row("isa", format!("{} of {}", chosen.isa.name(), names.join(", ")));
-    row("kernels", format!("{}, {}, {}", chosen.gemm_f32.name, chosen.gemm_f16.name, chosen.vector.name));
+    let names = [chosen.gemm_f32.name, chosen.gemm_f16.name, chosen.gemm_s8.name, chosen.vector.name];
+    row("kernels", names.join(", "));
+    row("peak", format!("{:.0} GFLOP/s f32, {:.0} GOP/s int8, one core", f32_peak / 1e9, s8_peak / 1e9));
     console.report(&json, &text)
 }
 
