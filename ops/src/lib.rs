@@ -15,6 +15,7 @@
 //! | `activation.rs` `elementwise.rs` | exp, sigmoid, erf, gelu; sums, pixel shuffle |
 //! | `resize.rs` | bilinear maps, Pillow's 8-bit resize, position tables |
 //! | `trig.rs` | f64 sin, cos, exp, ln for tables |
+//! | `prefetch.rs` | the hint to fetch a cache line |
 //! | `peak.rs` | the arithmetic peak of one core, for `doctor` and `bench` |
 //! | `reference.rs` | the definition of every op in plain loops |
 //!
@@ -33,6 +34,7 @@ pub mod layernorm;
 pub mod mat;
 pub mod par;
 pub mod peak;
+pub mod prefetch;
 pub mod quantize;
 pub mod reference;
 pub mod resize;

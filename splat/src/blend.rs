@@ -13,6 +13,9 @@
 //! T carries the sign of life: a finished pixel holds -T, which keeps T for the output, and no alpha makes
 //! a negative T pass the test of the next T.
 
+use std::ops::Range;
+
+use sf_ops::prefetch::prefetch;
 use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::{self, KeyForm};
@@ -28,6 +31,8 @@ const PER_ROW: usize = SIDE / BLOCK;
 const BLOCKS: usize = PER_ROW * PER_ROW;
 /// Entries dealt out together: 12 KiB of them and at most 16 KiB of lists stay in the first-level cache.
 const CHUNK: usize = 256;
+/// Entries between the second hint for a record and its use.
+const AHEAD: usize = 16;
 /// Most depth buckets of a list.
 const BUCKETS: usize = 1024;
 
@@ -170,31 +175,34 @@ impl Body for Blend<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let Blend { tile, place, shared } = self;
-        let form = shared.form;
+        let (form, first) = (shared.form, (place.x, place.y));
         let buckets = tile.split(form);
+        // Kept keys move to the front of the list, in order; `dealt..kept` wait for their records.
+        let (mut dealt, mut kept) = (0, 0);
         for b in 0..buckets {
             let (start, end) = (tile.starts[b] as usize, tile.starts[b + 1] as usize);
-            let mut kept = start;
+            let sorted = kept;
             for i in start..end {
                 let key = tile.keys[1][i];
-                let mask = form.blocks(key, || shared.record(key).blocks((place.x, place.y)));
+                let mask = form.blocks(key, || shared.record(key).blocks(first));
                 tile.keys[1][kept] = key;
                 kept += usize::from(mask & tile.alive != 0);
             }
-            sort(&mut tile.keys[1][start..kept]);
-            for i in start..kept {
-                let key = tile.keys[1][i];
-                let record = shared.record(key);
-                tile.deal(record, place, form.blocks(key, || record.blocks((place.x, place.y))));
-                if tile.chunk.len == CHUNK {
-                    tile.draw(s, shared);
-                    if tile.alive == 0 {
-                        return;
-                    }
+            sort(&mut tile.keys[1][sorted..kept]);
+            // Records lie in index order and are wanted in depth order: nearly every one is a cache miss, so all
+            // of a chunk are on their way before the first is read.
+            for &key in &tile.keys[1][sorted..kept] {
+                prefetch(shared.record(key));
+            }
+            while kept - dealt >= CHUNK {
+                tile.deal_and_draw(s, place, shared, dealt..dealt + CHUNK);
+                dealt += CHUNK;
+                if tile.alive == 0 {
+                    return;
                 }
             }
         }
-        tile.draw(s, shared);
+        tile.deal_and_draw(s, place, shared, dealt..kept);
     }
 }
 
@@ -274,6 +282,19 @@ impl Tile {
         buckets
     }
 
+    /// Draws at most [`CHUNK`] keys of the list.
+    #[inline(always)]
+    fn deal_and_draw<S: Simd>(&mut self, s: S, place: Place, shared: &Shared, keys: Range<usize>) {
+        for i in keys.clone() {
+            // Again, for those that the first hint lost.
+            prefetch(shared.record(self.keys[1][(i + AHEAD).min(keys.end - 1)]));
+            let key = self.keys[1][i];
+            let record = shared.record(key);
+            self.deal(record, place, shared.form.blocks(key, || record.blocks((place.x, place.y))));
+        }
+        self.draw(s, shared);
+    }
+
     /// Appends a Gaussian to the chunk and to the lists of the unfinished ones of `blocks`.
     #[inline(always)]
     fn deal(&mut self, r: &Record, place: Place, blocks: u64) {
@@ -323,12 +344,13 @@ impl Tile {
         self.chunk.lens = [0; BLOCKS];
     }
 
-    /// T and the sums of red, green, blue, z of a pixel of the tile.
-    #[inline]
-    pub fn pixel(&self, x: usize, y: usize) -> (f32, [f32; 4]) {
-        let (b, l) = (y / BLOCK * PER_ROW + x / BLOCK, y % BLOCK * BLOCK + x % BLOCK);
-        let block = &self.blocks[b];
-        (block.t[l].abs(), block.sum.map(|s| s[l]))
+    /// Four neighbouring pixels of row `y`, from column `4 column`: T, and the sums of red, green, blue and z.
+    #[inline(always)]
+    pub fn four(&self, column: usize, y: usize) -> ([f32; BLOCK], [[f32; BLOCK]; 4]) {
+        let block = &self.blocks[y / BLOCK * PER_ROW + column];
+        let row = |v: &[f32; LANES]| v.as_chunks::<BLOCK>().0[y % BLOCK];
+        let sums = [row(&block.sum[0]), row(&block.sum[1]), row(&block.sum[2]), row(&block.sum[3])];
+        (row(&block.t).map(f32::abs), sums)
     }
 
     /// The extra sums of a pixel of the tile.

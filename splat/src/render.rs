@@ -12,7 +12,7 @@ use sf_ops::Kernels;
 use sf_ops::par::Pool;
 
 use crate::bin::{self, GROUPS, Group, KeyForm};
-use crate::blend::{Blend, Channels, Place, Shared, Tile};
+use crate::blend::{BLOCK, Blend, Channels, Place, Shared, Tile};
 use crate::project::{self, Counts, Projector, TILE};
 
 /// Further values per Gaussian, composited like colour but without a background: velocity, dynamic
@@ -322,17 +322,26 @@ struct Band<'a> {
 impl Band<'_> {
     fn store(&mut self, tile: &Tile, place: Place, (width, channels): (usize, usize), background: [f32; 3]) {
         for y in 0..place.height {
-            let row = y * width + place.x;
-            for x in 0..place.width {
-                let (t, [r, g, b, z]) = tile.pixel(x, y);
-                let rgb = &mut self.rgb[(row + x) * 3..][..3];
-                for (out, (sum, behind)) in rgb.iter_mut().zip([r, g, b].into_iter().zip(background)) {
-                    *out = sum + t * behind;
+            let start = y * width + place.x;
+            let pixels = start..start + place.width;
+            let rgb = self.rgb[3 * pixels.start..3 * pixels.end].chunks_mut(3 * BLOCK);
+            let depth = self.depth[pixels.clone()].chunks_mut(BLOCK);
+            let alpha = self.alpha[pixels.clone()].chunks_mut(BLOCK);
+            for (column, ((rgb, depth), alpha)) in rgb.zip(depth).zip(alpha).enumerate() {
+                let (t, [r, g, b, z]) = tile.four(column, y);
+                for (x, out) in rgb.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                    *out = [r[x] + t[x] * background[0], g[x] + t[x] * background[1], b[x] + t[x] * background[2]];
                 }
-                self.depth[row + x] = z;
-                self.alpha[row + x] = 1.0 - t;
-                let sums = tile.extra(x, y, channels);
-                self.extra[(row + x) * channels..][..channels].iter_mut().zip(sums).for_each(|(v, sum)| *v = sum);
+                depth.copy_from_slice(&z[..depth.len()]);
+                for (out, t) in alpha.iter_mut().zip(t) {
+                    *out = 1.0 - t;
+                }
+            }
+            if channels > 0 {
+                let rows = self.extra[pixels.start * channels..pixels.end * channels].chunks_exact_mut(channels);
+                for (x, out) in rows.enumerate() {
+                    out.iter_mut().zip(tile.extra(x, y, channels)).for_each(|(v, sum)| *v = sum);
+                }
             }
         }
     }
