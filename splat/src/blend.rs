@@ -235,6 +235,16 @@ impl Tile {
         self.updates = 0;
     }
 
+    /// Makes room for lists of up to `entries` keys and for extra sums, so that no tile of an image allocates.
+    pub fn reserve(&mut self, entries: usize, channels: usize) {
+        for keys in &mut self.keys {
+            keys.clear();
+            keys.reserve(entries);
+        }
+        self.extra.clear();
+        self.extra.reserve(BLOCKS * channels);
+    }
+
     /// Adds keys to the list.
     pub fn push(&mut self, keys: &[u64]) {
         self.keys[0].extend_from_slice(keys);

@@ -12,8 +12,8 @@ use sf_ops::Kernels;
 use sf_ops::par::Pool;
 
 use crate::bin::{self, GROUPS, Group, KeyForm};
-use crate::blend::{BLOCK, Blend, Channels, Place, Shared, Tile};
-use crate::project::{self, Counts, Projector, TILE};
+use crate::blend::{Blend, Channels, Place, Shared, Tile};
+use crate::project::{self, BLOCK, Counts, Projector, TILE};
 
 /// Further values per Gaussian, composited like colour but without a background: velocity, dynamic
 /// probability, class scores.
@@ -286,6 +286,12 @@ impl Renderer {
                 extra: extra.next().unwrap_or_default(),
             })
         });
+        // Which worker takes which tile is open, so every one gets room for the longest list.
+        let entries = |t: usize| groups.iter().map(|g| g.tile(t).len()).sum();
+        let longest = (0..columns * rows).map(entries).max().unwrap_or(0);
+        for tile in &self.tiles {
+            lock(tile).reserve(longest, channels);
+        }
         let updates = AtomicU64::new(0);
         self.pool.run(columns * rows, &|t, worker| {
             let mut tile = lock(&self.tiles[worker]);
