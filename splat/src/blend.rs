@@ -2,7 +2,7 @@
 //!
 //! A tile is 32x32 pixels in 64 blocks of 4x4, one vector of sixteen lanes each. Its list of keys is split into
 //! buckets of depth, and only the bucket about to be drawn is filtered and sorted: entries that meet nothing
-//! but finished blocks are dropped by one AND of 64-bit masks. Up to [`CHUNK`] entries in order are then dealt
+//! but finished blocks are dropped by one AND of 64-bit masks. Up to `CHUNK` entries in order are then dealt
 //! out to the blocks they meet, and every block takes its list in one go with its state in registers.
 //! A pixel sees its Gaussians in key order whatever the chunks are.
 //!
