@@ -62,7 +62,7 @@ impl OutputFolder {
         Ok(folder)
     }
 
-    /// Where to write files for now.
+    /// The hidden folder beside the target that collects the files until [`OutputFolder::commit`] renames it.
     pub(crate) fn path(&self) -> &Path {
         &self.stage
     }
