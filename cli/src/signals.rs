@@ -48,7 +48,21 @@ pub(crate) fn guard_file(file: &Path) {
 fn sweep() {
     let litter = litter();
     for stage in &litter.stages {
-        let _ = std::fs::remove_dir_all(stage);
+        // Busy threads still create files and subfolders: under another name the folder is out of their reach,
+        // and what they make anew at the old one is removed until it stays away.
+        let mut gone = stage.clone().into_os_string();
+        gone.push(".gone");
+        let gone = Path::new(&gone);
+        let mut quiet = 0;
+        for _ in 0..200 {
+            let _ = std::fs::rename(stage, gone);
+            let _ = std::fs::remove_dir_all(gone);
+            quiet = if stage.exists() || gone.exists() { 0 } else { quiet + 1 };
+            if quiet == 10 {
+                break;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
     }
     // The names that `sf_formats::atomic` gives: `.NAME.PID.tmp`.
     let suffix = format!(".{}.tmp", std::process::id());
