@@ -54,11 +54,11 @@ fn sweep() {
         gone.push(".gone");
         let gone = Path::new(&gone);
         let mut quiet = 0;
-        for _ in 0..200 {
+        for _ in 0..2000 {
             let _ = std::fs::rename(stage, gone);
             let _ = std::fs::remove_dir_all(gone);
             quiet = if stage.exists() || gone.exists() { 0 } else { quiet + 1 };
-            if quiet == 10 {
+            if quiet == 100 {
                 break;
             }
             std::thread::sleep(std::time::Duration::from_millis(1));
