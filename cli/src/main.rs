@@ -60,6 +60,7 @@ fn main() -> ExitCode {
             exit::Parsed::Wrong(e) => Err(e),
         },
     });
+    signals::wait_if_interrupted();
     exit::code(&result)
 }
 

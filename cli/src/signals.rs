@@ -77,6 +77,15 @@ fn sweep() {
     }
 }
 
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// Once interrupted, the thread that cleans up ends the process: whoever fails meanwhile waits for it.
+pub(crate) fn wait_if_interrupted() {
+    while INTERRUPTED.load(Ordering::Relaxed) {
+        std::thread::park();
+    }
+}
+
 static STDOUT_CLOSED: AtomicBool = AtomicBool::new(false);
 
 /// Runs before Rust's start-up code, which replaces a closed standard output by `/dev/null` and
@@ -133,6 +142,7 @@ pub(crate) fn install() {
         let mut signal = 0;
         // SAFETY: the set is initialised above and the signals in it are blocked.
         if unsafe { libc::sigwait(&waited, &mut signal) } == 0 {
+            INTERRUPTED.store(true, Ordering::Relaxed);
             sweep();
             eprintln!("error: interrupted; temporary files are removed");
             // SAFETY: ends the process without running the destructors of busy threads.
