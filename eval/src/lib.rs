@@ -6,6 +6,7 @@
 //! | `ssim.rs` | structural similarity as scikit-image's default |
 //! | `align.rs` | the similarity transform between two sets of poses |
 //! | `protocol.rs` | [`Protocol`]: which frames are context, which are tested, with which cameras |
+//! | `oracle_scene.rs` | [`oracle_scene()`]: the scene of a perfect network, from ground truth |
 //! | `evaluate.rs` | [`evaluate()`]: the measurement of a scene on them |
 //! | `report.rs` | [`EvalReport`]: means per method and part, as JSON and as a Markdown table |
 #![deny(unsafe_code)]
@@ -13,10 +14,12 @@
 pub mod align;
 pub mod evaluate;
 pub mod metrics;
+pub mod oracle_scene;
 pub mod protocol;
 pub mod report;
 pub mod ssim;
 
 pub use evaluate::evaluate;
+pub use oracle_scene::{OracleFrame, OracleOptions, oracle_of_clip, oracle_scene};
 pub use protocol::{EvalClip, EvalFrame, EvalOptions, Protocol, TargetPoses};
 pub use report::{EvalReport, Method, Metric, Part, Scores};
