@@ -9,7 +9,7 @@
 //! | `gemm/` | matrix product with f32 or f16 weights in K1N16 panels; its table and packers |
 //! | `gemm/s8/` | matrix product with int8 activations and weights, exact sums |
 //! | `quantize.rs` `hadamard.rs` | rows to int8 per token, after layer norm and random-sign Hadamard rotation |
-//! | `attention.rs` | frame-masked attention with streaming softmax |
+//! | `attention/` | frame-masked attention with streaming softmax, in f32 and in int8 |
 //! | `conv.rs` | convolution and transposed convolution through the panels |
 //! | `layernorm.rs` `rope.rs` | norms and rotary embedding |
 //! | `activation.rs` `elementwise.rs` | exp, sigmoid, erf, gelu; sums, pixel shuffle |

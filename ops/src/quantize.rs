@@ -86,7 +86,7 @@ fn largest<S: Simd>(s: S, x: &[f32]) -> (f32, bool) {
 
 /// To [-127, 127] by compare and select.
 #[inline(always)]
-fn clamp<S: Simd>(s: S, v: S::V) -> S::V {
+pub(crate) fn clamp<S: Simd>(s: S, v: S::V) -> S::V {
     let top = s.splat(127.0);
     let v = s.splat(-127.0).max(v);
     v.select_gt(top, top, v)

@@ -5,7 +5,7 @@
 //! serve as oracle for all of them. Weights come in the order of a checkpoint (`[out, in]`,
 //! `[out, in, kh, kw]`, `[in, out, k, k]`), so that packing is judged too. Not bit-equal to the fast ops.
 
-use crate::attention::FrameMask;
+use crate::attention::{FrameMask, QueryIntegers};
 use crate::gemm::Act;
 use crate::mat::{Hwc, Mat};
 use crate::resize::Corners;
@@ -232,6 +232,113 @@ pub fn attention(qkv: Mat, heads: usize, mask: FrameMask) -> Vec<f32> {
         }
     }
     out
+}
+
+/// [`attention`] in int8 as [`crate::attention::attention_s8`] defines it, without norm, embedding and rotation, for finite values.
+/// Returns the output and the integers inside, query by query and, inside, head by head. Its f32 steps are those of the definition,
+/// each rounded once, so outputs are bit-equal to the fast ones.
+pub fn attention_s8(qkv: Mat, heads: usize, mask: FrameMask) -> (Vec<f32>, Vec<QueryIntegers>) {
+    const KEYS: usize = 64;
+    const ROUND: f32 = 12_582_912.0;
+    let FrameMask { frames, tokens, .. } = mask;
+    let c = qkv.cols / 3;
+    let d = c / heads;
+    let factor = (1.0 / (d as f64).sqrt()) as f32;
+    let head = |row: usize, part: usize, h: usize| &qkv.row(row)[part * c + h * d..][..d];
+    let mut out = vec![0.0; qkv.rows * c];
+    let mut integers = vec![QueryIntegers::default(); qkv.rows * heads];
+    for h in 0..heads {
+        // Keys of each frame less their mean, values of each frame's tiles.
+        let mut means = Vec::new();
+        let (mut keys, mut values, mut steps) = (Vec::new(), Vec::new(), Vec::new());
+        for frame in 0..frames {
+            let mut mean = vec![0.0f32; d];
+            for t in 0..tokens {
+                mean.iter_mut().zip(head(frame * tokens + t, 1, h)).for_each(|(m, k)| *m += k);
+            }
+            mean.iter_mut().for_each(|m| *m /= tokens as f32);
+            for t in 0..tokens {
+                let centred: Vec<f32> = head(frame * tokens + t, 1, h).iter().zip(&mean).map(|(k, m)| k - m).collect();
+                keys.push(quantize(&centred));
+            }
+            means.push(mean);
+            for first in (0..tokens).step_by(KEYS) {
+                let rows: Vec<&[f32]> =
+                    (first..tokens.min(first + KEYS)).map(|t| head(frame * tokens + t, 2, h)).collect();
+                let columns: Vec<(Vec<i8>, f32)> =
+                    (0..d).map(|i| quantize(&rows.iter().map(|r| r[i]).collect::<Vec<f32>>())).collect();
+                steps.push(columns.iter().map(|(_, step)| *step).collect::<Vec<f32>>());
+                values.push(columns);
+            }
+        }
+        let tiles = tokens.div_ceil(KEYS);
+        for row in 0..qkv.rows {
+            let seen = mask.keys(row / tokens);
+            let of = &mut integers[row * heads + h];
+            let q = head(row, 0, h);
+            let (q8, scale) = quantize(q);
+            let scale = scale * factor;
+            let (mut top, mut total, mut sums) = (f32::NEG_INFINITY, 0.0f32, vec![0.0f32; d]);
+            for frame in seen.clone() {
+                let mut shift = 0.0f32;
+                if seen.len() > 1 {
+                    for (m, q) in means[frame].iter().zip(q) {
+                        shift = m.mul_add(q * factor, shift);
+                    }
+                }
+                for tile in 0..tiles {
+                    let first = tile * KEYS;
+                    let keys = &keys[frame * tokens + first..frame * tokens + tokens.min(first + KEYS)];
+                    let scores: Vec<i32> = keys
+                        .iter()
+                        .map(|(k, _)| k.iter().zip(&q8).map(|(&k, &q)| i32::from(k) * i32::from(q)).sum())
+                        .collect();
+                    let t: Vec<f32> = scores.iter().zip(keys).map(|(&s, (_, scale))| s as f32 * scale).collect();
+                    let tile_top = t.iter().fold(t[0], |a, &b| if b > a { b } else { a });
+                    let base2 = scale * std::f32::consts::LOG2_E;
+                    let weights: Vec<u8> = t
+                        .iter()
+                        .map(|t| {
+                            let floor = -20.0 / base2;
+                            let x = t - tile_top;
+                            let x = if floor > x { floor } else { x };
+                            let shifted = x.mul_add(base2, ROUND + 127.0);
+                            let n = shifted - (ROUND + 127.0);
+                            let r = x.mul_add(-base2, n);
+                            let p = (-13.972_243f32).mul_add(r, 61.521_637).mul_add(r, -176.093_87).mul_add(r, 254.0);
+                            let y = p.mul_add(f32::from_bits(shifted.to_bits() << 23), ROUND - 127.0);
+                            (y - (ROUND - 127.0)) as u8
+                        })
+                        .collect();
+                    let den: i32 = weights.iter().map(|&p| i32::from(p)).sum();
+                    let columns = &values[frame * tiles + tile];
+                    let n: Vec<i32> = columns
+                        .iter()
+                        .map(|(v, _)| v.iter().zip(&weights).map(|(&v, &p)| i32::from(v) * i32::from(p)).sum())
+                        .collect();
+                    let m = tile_top.mul_add(scale, shift);
+                    let new = if m > top { m } else { top };
+                    let (w, k) = (crate::activation::exp(m - new), crate::activation::exp(top - new));
+                    top = new;
+                    total = (den as f32).mul_add(w, total * k);
+                    for ((sum, &n), step) in sums.iter_mut().zip(&n).zip(&steps[frame * tiles + tile]) {
+                        *sum = (n as f32 * step).mul_add(w, *sum * k);
+                    }
+                    of.scores.extend(scores);
+                    of.weights.extend(weights);
+                    of.totals.push(den);
+                    of.sums.extend(n);
+                }
+            }
+            if !seen.is_empty() {
+                let share = 1.0 / total;
+                for (o, sum) in out[row * c + h * d..][..d].iter_mut().zip(sums) {
+                    *o = sum * share;
+                }
+            }
+        }
+    }
+    (out, integers)
 }
 
 /// Sizes of a convolution window.

@@ -27,7 +27,8 @@ pub enum AngleRound {
 /// cos and sin for every token of a frame.
 #[derive(Clone, Debug)]
 pub struct RopeTable {
-    /// `[tokens, d/2]`: row angles first, column angles second.
+    /// `[tokens, d/2]`: row angles first, column angles second; then 16 zeros, so that a whole vector may be loaded
+    /// from any angle on.
     cos: Vec<f32>,
     sin: Vec<f32>,
     tokens: usize,
@@ -61,6 +62,8 @@ impl RopeTable {
                 }
             }
         }
+        cos.resize(cos.len() + LANES, 0.0);
+        sin.resize(sin.len() + LANES, 0.0);
         RopeTable { cos, sin, tokens: positions.len(), head_dim }
     }
 
@@ -77,6 +80,13 @@ impl RopeTable {
     /// Head width d.
     pub fn head_dim(&self) -> usize {
         self.head_dim
+    }
+
+    /// (cos, sin) of one token and of what follows: d/2 values, and 16 more.
+    #[inline]
+    pub(crate) fn lanes(&self, token: usize) -> (&[f32], &[f32]) {
+        let n = self.head_dim / 2;
+        (&self.cos[token * n..][..n + LANES], &self.sin[token * n..][..n + LANES])
     }
 
     /// (cos, sin) of one token, d/2 values each: d/4 row angles, then d/4 column angles.
@@ -115,7 +125,7 @@ pub(crate) struct RopeRow<'a> {
 
 /// a cos - b sin and b cos + a sin; the second product is rounded, the first fused.
 #[inline(always)]
-fn turn<V: Vector>(a: V, b: V, cos: V, sin: V, zero: V) -> (V, V) {
+pub(crate) fn turn<V: Vector>(a: V, b: V, cos: V, sin: V, zero: V) -> (V, V) {
     (a.mul_add(cos, zero - b * sin), b.mul_add(cos, a * sin))
 }
 

@@ -1,6 +1,6 @@
 //! A second run of any op allocates nothing.
 
-use sf_ops::attention::{FrameMask, attention, scratch_len};
+use sf_ops::attention::{FrameMask, Heads, attention, attention_s8, scratch_len, scratch_len_s8};
 use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
 use sf_ops::gemm::{
     Act, Epilogue, Panels, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, pack_f32, panel_len, panel_len_s8,
@@ -45,7 +45,7 @@ fn the_second_run_allocates_nothing() {
     let mut panels = vec![0.0; panel_len(c, 9 * c)];
     pack_f32(&vec![0.01; c * 9 * c], c, 9 * c, &mut panels);
     let mask = FrameMask { frames, tokens, lo: 0, hi: 1 };
-    let mut scratch = vec![0.0; scratch_len(&mask, heads, d, 2)];
+    let mut scratch = vec![0.0; scratch_len(&mask, heads, d, 2).max(scratch_len_s8(&mask, heads, d, 2))];
     let positions: Vec<(u32, u32)> = (0..tokens as u32).map(|i| (i / 10, i % 10)).collect();
     let table = RopeTable::new(&positions, d, 100.0, AngleRound::None);
     let mut qkv = x.clone();
@@ -71,6 +71,8 @@ fn the_second_run_allocates_nothing() {
         layernorm::layernorm(ctx, a, &x[..c], &x[..c], 1e-6, MatMut::new(&mut y, rows, c));
         qk_norm_rope(ctx, MatMut::new(&mut qkv, rows, 3 * c), heads, None, Some(&table));
         attention(ctx, Mat::new(&qkv, rows, 3 * c), heads, mask, &mut scratch, MatMut::new(&mut y, rows, c));
+        let x_s8 = Heads { qkv: Mat::new(&qkv, rows, 3 * c), heads, norm: None, rope: Some(&table), rotation: None };
+        attention_s8(ctx, x_s8, mask, &mut scratch, MatMut::new(&mut y, rows, c));
         elementwise::gelu_in_place(ctx, &mut y);
         let image = Hwc::new(&x[..rows * c], 10, 14, c);
         let norm = Norm { affine: None, eps: 1e-6 };

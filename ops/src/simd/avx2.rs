@@ -93,6 +93,22 @@ unsafe fn quarter<const ROW: usize, const COL: usize>(x: &[[f32; LANES]; LANES])
     }
 }
 
+/// The lowest bytes of four vectors side by side in each lane.
+///
+/// # Safety
+/// The CPU has avx2.
+#[inline(always)]
+unsafe fn low_bytes(v: [__m256; 4]) -> __m256i {
+    // SAFETY: the caller's promise.
+    unsafe {
+        let (a, b) = (_mm256_castps_si256(v[0]), _mm256_castps_si256(v[1]));
+        let (c, d) = (_mm256_castps_si256(v[2]), _mm256_castps_si256(v[3]));
+        let even = _mm256_blend_epi16::<0xaa>(a, _mm256_slli_epi32::<16>(c));
+        let odd = _mm256_blend_epi16::<0xaa>(b, _mm256_slli_epi32::<16>(d));
+        _mm256_or_si256(_mm256_and_si256(even, _mm256_set1_epi16(0xff)), _mm256_slli_epi16::<8>(odd))
+    }
+}
+
 /// Eight rows of eight, swapped.
 ///
 /// # Safety
@@ -260,6 +276,16 @@ impl Vector for V {
             let words = _mm256_permute4x64_epi64::<0xd8>(words);
             let bytes = _mm_packs_epi16(_mm256_castsi256_si128(words), _mm256_extracti128_si256::<1>(words));
             _mm_storeu_si128(x.as_mut_ptr().cast(), bytes);
+        }
+    }
+
+    #[inline(always)]
+    fn store_low_bytes([a, b, c, d]: [V; 4], x: &mut [i8; 4 * LANES]) {
+        let p = x.as_mut_ptr().cast::<__m256i>();
+        // SAFETY: the vectors prove avx2; 64 bytes are writable.
+        unsafe {
+            _mm256_storeu_si256(p, low_bytes([a.0, b.0, c.0, d.0]));
+            _mm256_storeu_si256(p.add(1), low_bytes([a.1, b.1, c.1, d.1]));
         }
     }
 }

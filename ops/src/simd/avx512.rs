@@ -201,6 +201,19 @@ impl Vector for V {
         // SAFETY: the vector proves avx512f; 16 bytes are writable.
         unsafe { _mm_storeu_si128(x.as_mut_ptr().cast(), _mm512_cvtepi32_epi8(_mm512_cvtps_epi32(self.0))) }
     }
+
+    #[inline(always)]
+    fn store_low_bytes([a, b, c, d]: [V; 4], x: &mut [i8; 4 * LANES]) {
+        // SAFETY: the vectors prove avx512f and avx512bw; 64 bytes are writable. 0xca: first ? second : third, bit by bit.
+        unsafe {
+            let (a, b) = (_mm512_castps_si512(a.0), _mm512_slli_epi32::<8>(_mm512_castps_si512(b.0)));
+            let (c, d) = (_mm512_castps_si512(c.0), _mm512_slli_epi32::<8>(_mm512_castps_si512(d.0)));
+            let low = _mm512_set1_epi32(0xff);
+            let ab = _mm512_ternarylogic_epi32::<0xca>(low, a, b);
+            let cd = _mm512_slli_epi32::<16>(_mm512_ternarylogic_epi32::<0xca>(low, c, d));
+            _mm512_storeu_si512(x.as_mut_ptr().cast(), _mm512_mask_blend_epi16(0xaaaa_aaaa, ab, cd));
+        }
+    }
 }
 
 super::table::vector_kernels!(

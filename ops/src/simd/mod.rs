@@ -75,6 +75,8 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn swap<const H: usize>(self) -> Self;
     /// Lanes in [-127, 127] to bytes, rounded to nearest, ties to even.
     fn store_s8(self, x: &mut [i8; LANES]);
+    /// Byte 4i + j takes the lowest byte of the bits of lane i of vector j.
+    fn store_low_bytes(v: [Self; 4], x: &mut [i8; 4 * LANES]);
 }
 
 /// Sum of the lanes in the one fixed order: l + (l+8), then +4, +2, +1.

@@ -263,6 +263,20 @@ impl Vector for V {
             vst1q_s8(x.as_mut_ptr(), vcombine_s8(vmovn_s16(low), vmovn_s16(high)));
         }
     }
+
+    #[inline(always)]
+    fn store_low_bytes([a, b, c, d]: [V; 4], x: &mut [i8; 4 * LANES]) {
+        // SAFETY: the vectors prove neon; 64 bytes are writable.
+        unsafe {
+            for i in 0..4 {
+                let (a, b) = (vreinterpretq_u32_f32(a.0[i]), vreinterpretq_u32_f32(b.0[i]));
+                let (c, d) = (vreinterpretq_u32_f32(c.0[i]), vreinterpretq_u32_f32(d.0[i]));
+                // Shift left and insert keeps the bits below.
+                let bytes = vsliq_n_u32::<24>(vsliq_n_u32::<16>(vsliq_n_u32::<8>(a, b), c), d);
+                vst1q_s8(x.as_mut_ptr().add(16 * i), vreinterpretq_s8_u32(bytes));
+            }
+        }
+    }
 }
 
 /// Bit i of a lane mask.

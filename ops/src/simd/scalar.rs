@@ -138,6 +138,11 @@ impl Vector for Lanes {
     fn store_s8(self, x: &mut [i8; LANES]) {
         *x = self.0.map(round_s8);
     }
+
+    #[inline(always)]
+    fn store_low_bytes(v: [Lanes; 4], x: &mut [i8; 4 * LANES]) {
+        *x = std::array::from_fn(|i| v[i % 4].0[i / 4].to_bits() as i8);
+    }
 }
 
 /// A value in [-127, 127] to the nearest integer, ties to even: adding 1.5 * 2^23 leaves it in the low bits.
@@ -273,6 +278,13 @@ impl Vector for Lane {
     #[inline(always)]
     fn store_s8(self, x: &mut [i8; LANES]) {
         x[0] = round_s8(self.0);
+    }
+
+    #[inline(always)]
+    fn store_low_bytes(v: [Lane; 4], x: &mut [i8; 4 * LANES]) {
+        for j in 0..4 {
+            x[j] = v[j].0.to_bits() as i8;
+        }
     }
 }
 

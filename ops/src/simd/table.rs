@@ -6,7 +6,8 @@
 #![allow(unsafe_code)]
 
 use crate::activation::Map;
-use crate::attention::SoftmaxTile;
+use crate::attention::heads::{KeyPack, QueryPack, ValuePack};
+use crate::attention::softmax::{MergeS8, Rows, SoftmaxTile, WeightsS8};
 use crate::cpu::{Features, Kernels};
 use crate::gemm::pack::RowPack;
 use crate::gemm::s8::tile::{FinishS8, QuadPack};
@@ -32,8 +33,20 @@ pub struct VectorKernels {
     pub(crate) norm: unsafe fn(NormRow),
     /// `rope::rope_row`.
     pub(crate) rope: unsafe fn(RopeRow),
-    /// `attention::softmax_tile`.
+    /// `attention::softmax::softmax_tile`.
     pub(crate) softmax: unsafe fn(SoftmaxTile),
+    /// `attention::softmax::store_rows`.
+    pub(crate) store_rows: unsafe fn(Rows),
+    /// `attention::softmax::weights_tile`.
+    pub(crate) weights_s8: unsafe fn(WeightsS8),
+    /// `attention::softmax::merge_tile`.
+    pub(crate) merge_s8: unsafe fn(MergeS8),
+    /// `attention::heads::pack_keys`.
+    pub(crate) pack_keys: unsafe fn(KeyPack),
+    /// `attention::heads::pack_queries`.
+    pub(crate) pack_queries: unsafe fn(QueryPack),
+    /// `attention::heads::pack_values`.
+    pub(crate) pack_values: unsafe fn(ValuePack),
     /// `gemm::tile::finish`.
     pub(crate) finish: unsafe fn(Finish),
     /// `gemm::pack::pack_rows`.
@@ -84,8 +97,32 @@ macro_rules! vector_kernels {
                 crate::rope::rope_row($token::new(), row);
             }
             $(#[target_feature(enable = $features)])?
-            fn softmax(tile: crate::attention::SoftmaxTile) {
-                crate::attention::softmax_tile($token::new(), tile);
+            fn softmax(tile: crate::attention::softmax::SoftmaxTile) {
+                crate::attention::softmax::softmax_tile($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn store_rows(tile: crate::attention::softmax::Rows) {
+                crate::attention::softmax::store_rows($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn weights_s8(tile: crate::attention::softmax::WeightsS8) {
+                crate::attention::softmax::weights_tile($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn merge_s8(tile: crate::attention::softmax::MergeS8) {
+                crate::attention::softmax::merge_tile($token::new(), tile);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn pack_keys(rows: crate::attention::heads::KeyPack) {
+                crate::attention::heads::pack_keys($token::new(), rows);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn pack_queries(rows: crate::attention::heads::QueryPack) {
+                crate::attention::heads::pack_queries($token::new(), rows);
+            }
+            $(#[target_feature(enable = $features)])?
+            fn pack_values(rows: crate::attention::heads::ValuePack) {
+                crate::attention::heads::pack_values($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
             fn finish(tile: crate::gemm::tile::Finish) {
@@ -127,6 +164,12 @@ macro_rules! vector_kernels {
                 norm,
                 rope,
                 softmax,
+                store_rows,
+                weights_s8,
+                merge_s8,
+                pack_keys,
+                pack_queries,
+                pack_values,
                 finish,
                 pack,
                 pack_quads,
@@ -173,6 +216,42 @@ impl Kernels {
     pub(crate) fn softmax(&self, tile: SoftmaxTile) {
         // SAFETY: chosen under the detected features.
         unsafe { (self.vector.softmax)(tile) }
+    }
+
+    #[inline]
+    pub(crate) fn store_rows(&self, tile: Rows) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.store_rows)(tile) }
+    }
+
+    #[inline]
+    pub(crate) fn weights_s8(&self, tile: WeightsS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.weights_s8)(tile) }
+    }
+
+    #[inline]
+    pub(crate) fn merge_s8(&self, tile: MergeS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.merge_s8)(tile) }
+    }
+
+    #[inline]
+    pub(crate) fn pack_keys(&self, rows: KeyPack) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.pack_keys)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn pack_queries(&self, rows: QueryPack) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.pack_queries)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn pack_values(&self, rows: ValuePack) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.pack_values)(rows) }
     }
 
     #[inline]

@@ -2,7 +2,7 @@
 //! product's numbers: it belongs in the changelog.
 
 use crate::common::{Random, everywhere};
-use sf_ops::attention::{FrameMask, attention, scratch_len};
+use sf_ops::attention::{FrameMask, Heads, attention, attention_s8, scratch_len, scratch_len_s8};
 use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
 use sf_ops::gemm::{
     Act, Epilogue, Panels, PanelsS8, RowsS8, RowsS8Mut, col_sums, gemm, gemm_s8, pack_f16, pack_f32, pack_s8, padded_k,
@@ -78,6 +78,30 @@ fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
         let out = MatMut::new(&mut y, frames * tokens, heads * d);
         attention(ctx, Mat::new(&turned, frames * tokens, 3 * heads * d), heads, mask, &mut scratch, out);
         h.values(&y);
+    });
+    add("attention_s8", &mut |h| {
+        // Norm and embedding inside, then a rotation and no norm.
+        let wide: Vec<f32> = qkv.iter().chain(&turned).take(2 * 101 * 3 * 48).copied().collect();
+        let wide = Mat::new(&wide, 2 * 101, 3 * 48);
+        let signs = [0x1b3d, 0x7f21, 0x0456];
+        let inside = Heads {
+            qkv: Mat::new(&qkv, frames * tokens, 3 * heads * d),
+            heads,
+            norm: Some(norm),
+            rope: Some(&table),
+            rotation: None,
+        };
+        let rotated = Heads { qkv: wide, heads: 1, norm: None, rope: None, rotation: Some(Rotation::new(48, &signs)) };
+        for (x, mask) in [
+            (inside, FrameMask { frames, tokens, lo: -1, hi: 0 }),
+            (rotated, FrameMask { frames: 2, tokens, lo: 0, hi: 0 }),
+        ] {
+            let mut scratch = vec![0.0; scratch_len_s8(&mask, x.heads, x.head_dim(), ctx.pool.threads())];
+            let cols = x.heads * x.head_dim();
+            let mut y = vec![0.0; x.qkv.rows * cols];
+            attention_s8(ctx, x, mask, &mut scratch, MatMut::new(&mut y, x.qkv.rows, cols));
+            h.values(&y);
+        }
     });
 
     let (m, n, k) = (29, 53, 1104);
@@ -162,11 +186,12 @@ fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
 
 #[test]
 fn one_hash_on_every_architecture() {
-    let expected: [(&str, u64); 10] = [
+    let expected: [(&str, u64); 11] = [
         ("gemm", 0x3b38_01f7_f874_0f00),
         ("layernorm", 0x8906_f5da_73ab_4ea7),
         ("rope", 0xa9fc_176d_24de_7e1c),
         ("attention", 0x60ab_c85b_fb17_8428),
+        ("attention_s8", 0x5416_126b_410f_512a),
         ("int8", 0x2470_8ce5_2820_2599),
         ("conv2d", 0x5dd3_78aa_c81e_9282),
         ("conv_transpose", 0xe266_fa32_c915_87fd),

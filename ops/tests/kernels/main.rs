@@ -2,6 +2,7 @@
 //! and on 1, 2 and 3 threads.
 
 mod attention;
+mod attention_s8;
 mod common;
 mod conv;
 mod gemm;

@@ -1,13 +1,20 @@
 //! softmax(q k^T / sqrt(d)) v under a block mask of frames, with streaming softmax over key tiles.
 
-use crate::activation::exp_lanes;
+pub(crate) mod heads;
+mod int8;
+mod integers;
+pub(crate) mod softmax;
+
+pub use int8::{Heads, attention_s8, scratch_len_s8};
+pub use integers::{QueryIntegers, attention_s8_integers};
+
 use crate::cpu::{Ctx, Kernels};
 use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
 use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::mat::{Mat, MatMut};
 use crate::par::SharedMut;
-use crate::simd::{LANES, Simd, Vector};
+use softmax::{Rows, SoftmaxTile};
 
 /// Which frames a frame may look at: a query in frame a sees the keys of frame b iff lo <= b - a <= hi.
 ///
@@ -44,50 +51,6 @@ const QUERIES: usize = 2 * NR;
 /// Keys between two rescalings, a multiple of every kernel's tile height (4, 6, 12). 96 keys x 32 queries of scores
 /// are 12 KiB, which stay in the first-level cache together with the sums.
 const KEYS: usize = 96;
-
-/// Scores of up to [`KEYS`] keys for 16 queries, and the running state of those queries.
-pub(crate) struct SoftmaxTile<'a> {
-    /// `[keys][16]`: scores in, weights e^(score - top) out.
-    pub scores: &'a mut [f32],
-    /// Largest score so far.
-    pub top: &'a mut [f32; LANES],
-    /// Sum of weights so far.
-    pub total: &'a mut [f32; LANES],
-    /// `[d][16]`: sums of weighted values so far, rescaled to the new top.
-    pub sums: &'a mut [f32],
-}
-
-/// One step of the streaming softmax. Weights are added in four interleaved chains, folded in a fixed order.
-#[inline(always)]
-pub(crate) fn softmax_tile<S: Simd>(s: S, t: SoftmaxTile) {
-    let keys = t.scores.as_chunks_mut::<LANES>().0;
-    let old = s.load(t.top);
-    let mut top = old;
-    for k in keys.iter() {
-        top = s.load(k).max(top);
-    }
-    top.store(t.top);
-    let shrink = exp_lanes(s, old - top);
-    let mut chains = [s.splat(0.0); 4];
-    let mut quads = keys.chunks_exact_mut(4);
-    for quad in &mut quads {
-        for i in 0..4 {
-            let w = exp_lanes(s, s.load(&quad[i]) - top);
-            w.store(&mut quad[i]);
-            chains[i] = chains[i] + w;
-        }
-    }
-    for (i, k) in quads.into_remainder().iter_mut().enumerate() {
-        let w = exp_lanes(s, s.load(k) - top);
-        w.store(k);
-        chains[i] = chains[i] + w;
-    }
-    let sum = (chains[0] + chains[1]) + (chains[2] + chains[3]);
-    s.load(t.total).mul_add(shrink, sum).store(t.total);
-    for row in t.sums.as_chunks_mut::<LANES>().0 {
-        (s.load(row) * shrink).store(row);
-    }
-}
 
 /// f32 values of scratch that [`attention`] needs in a pool of `threads`.
 pub fn scratch_len(mask: &FrameMask, heads: usize, head_dim: usize, threads: usize) -> usize {
@@ -218,21 +181,24 @@ impl Job<'_> {
                 }
             }
         }
-        let seen = !self.mask.keys(frame).is_empty();
-        for i in 0..queries {
-            let (p, l) = (i / NR, i % NR);
-            let at = (frame * tokens + first + i) * out_stride + head * d;
-            // SAFETY: the columns of one head in one row belong to one block.
-            #[allow(unsafe_code)]
-            let out = unsafe { out.slice(at..at + d) };
-            if seen {
-                let share = 1.0 / total[p][l];
-                for (o, sum) in out.iter_mut().zip(sums[p * room.d * NR + l..].iter().step_by(NR)) {
-                    *o = sum * share;
-                }
-            } else {
-                out.fill(0.0);
+        let at = (frame * tokens + first) * out_stride + head * d;
+        if self.mask.keys(frame).is_empty() {
+            for q in 0..queries {
+                // SAFETY: the columns of one head in one row belong to one block.
+                #[allow(unsafe_code)]
+                unsafe { out.slice(at + q * out_stride..at + q * out_stride + d) }.fill(0.0);
             }
+            return;
+        }
+        for p in 0..queries.div_ceil(NR) {
+            self.kernels.store_rows(Rows {
+                sums: &mut sums[p * room.d * NR..][..d * NR],
+                total: &total[p],
+                queries: NR.min(queries - p * NR),
+                out,
+                at: at + p * NR * out_stride,
+                stride: out_stride,
+            });
         }
     }
 }
