@@ -2,7 +2,7 @@
 
 use crate::activation::Map;
 use crate::cpu::Ctx;
-use crate::mat::{HwcMut, Mat};
+use crate::mat::{Hwc, HwcMut, Mat};
 use crate::simd::{LANES, Simd, Vector, padded};
 
 /// Values of one task: 64 KiB, so that a region pays for its microsecond.
@@ -65,22 +65,33 @@ pub fn add_assign(ctx: Ctx, x: &mut [f32], y: &[f32]) {
 /// Column `ch * p * p + dy * p + dx` of patch (y, x) fills pixel (y p + dy, x p + dx) of channel ch:
 /// `x` `[ph * pw, c * p * p]` -> `out` `[ph * p, pw * p, c]`.
 pub fn pixel_shuffle(ctx: Ctx, x: Mat, grid: (usize, usize), p: usize, out: HwcMut) {
+    let nothing = Hwc::new(&[], out.h, out.w, 0);
+    pixel_shuffle_beside(ctx, x, grid, p, nothing, out);
+}
+
+/// [`pixel_shuffle`] of `x` `[ph * pw, c * p * p]` to the first c channels of every pixel, those of `beside`
+/// `[ph * p, pw * p, g]` after them: `out` `[ph * p, pw * p, c + g]`.
+pub fn pixel_shuffle_beside(ctx: Ctx, x: Mat, grid: (usize, usize), p: usize, beside: Hwc, out: HwcMut) {
     let (ph, pw) = grid;
-    let c = out.c;
+    let (all, g) = (out.c, beside.c);
+    let c = all.checked_sub(g).unwrap_or_else(|| panic!("{g} channels beside others do not fit {all}"));
+    assert_eq!((beside.h, beside.w), (out.h, out.w), "size of what stands beside");
     assert_eq!((x.rows, x.cols), (ph * pw, c * p * p), "{ph} x {pw} patches of {p} x {p} x {c}");
     assert_eq!((out.h, out.w), (ph * p, pw * p), "shuffled size");
-    let line = out.w * c;
+    let (line, width) = (out.w * all, out.w);
     if line == 0 {
         return;
     }
     // One task per output line.
     ctx.pool.chunks(out.data, line, &|oy, piece, _| {
-        for (px, patch) in piece.chunks_exact_mut(p * c).enumerate() {
+        for (px, patch) in piece.chunks_exact_mut(p * all).enumerate() {
             let row = &x.row(oy / p * pw + px)[oy % p * p..];
-            for (dx, pixel) in patch.chunks_exact_mut(c).enumerate() {
-                for (ch, v) in pixel.iter_mut().enumerate() {
+            for (dx, pixel) in patch.chunks_exact_mut(all).enumerate() {
+                let (own, others) = pixel.split_at_mut(c);
+                for (ch, v) in own.iter_mut().enumerate() {
                     *v = row[ch * p * p + dx];
                 }
+                others.copy_from_slice(&beside.data[(oy * width + px * p + dx) * g..][..g]);
             }
         }
     });

@@ -3,7 +3,7 @@
 use crate::common::{CANARY, Random, Same, close, everywhere, same_bits};
 use crate::tolerance::{self, NORM};
 use sf_ops::rope::{AngleRound, QkNorm, RopeTable, qk_norm_rope};
-use sf_ops::{HwcMut, Mat, MatMut, elementwise, layernorm, reference};
+use sf_ops::{Hwc, HwcMut, Mat, MatMut, elementwise, layernorm, reference};
 
 #[test]
 fn layernorm_matches_its_definition() {
@@ -166,6 +166,20 @@ fn pixel_shuffle_matches_its_definition() {
             same_bits(&y, &expected, name);
         });
     }
+    // The same beside other channels.
+    let (grid, p, c, g) = ((2, 3), 7, 5, 3);
+    let (h, w, cols) = (grid.0 * p, grid.1 * p, c * p * p);
+    let x = Random::new(1).vec(grid.0 * grid.1 * cols);
+    let beside = Random::new(2).vec(h * w * g);
+    let own = reference::pixel_shuffle(Mat::new(&x, grid.0 * grid.1, cols), grid, p);
+    let pixels = own.chunks_exact(c).zip(beside.chunks_exact(g));
+    let expected: Vec<f32> = pixels.flat_map(|(own, beside)| [own, beside].concat()).collect();
+    everywhere(|ctx, name| {
+        let mut y = vec![CANARY; expected.len()];
+        let (x, out) = (Mat::new(&x, grid.0 * grid.1, cols), HwcMut::new(&mut y, h, w, c + g));
+        elementwise::pixel_shuffle_beside(ctx, x, grid, p, Hwc::new(&beside, h, w, g), out);
+        same_bits(&y, &expected, name);
+    });
     // Column c*p*p + dy*p + dx holds its own coordinates: pixel (y, x) of channel c must read (y % p, x % p).
     let p = 14;
     let row: Vec<f32> = (0..2 * p * p).map(|i| i as f32).collect();
