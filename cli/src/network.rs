@@ -14,7 +14,7 @@ const CONFIG_CAP: u64 = 1 << 20;
 /// A network's sizes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Preset {
-    /// 12 M parameters: demonstrations, tests, small machines
+    /// 4.4 M parameters: demonstrations, small machines
     Nano,
     /// 114 M parameters
     Base,
@@ -24,11 +24,11 @@ pub(crate) enum Preset {
     Pi3,
 }
 
-/// Kind of the Gaussian and motion heads.
+/// Kind of the dense heads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Heads {
-    /// Convolutional pyramid: no seams between patches
-    Dpt,
+    /// The preset's or configuration's: convolutional pyramids, or convolutions beside the image (nano)
+    Own,
     /// Transformer decoder and one linear layer, as Pi3's own heads
     Linear,
 }
@@ -42,7 +42,7 @@ pub(crate) struct NetworkArgs {
     /// JSON file of settings (flat keys, docs/network.md); what it leaves out is as in base
     #[arg(long, value_name = "FILE", conflicts_with = "preset")]
     config: Option<PathBuf>,
-    /// Kind of the Gaussian and motion heads
+    /// Kind of the dense heads
     #[arg(long, value_enum)]
     heads: Option<Heads>,
 }
@@ -56,8 +56,7 @@ impl NetworkArgs {
         };
         Ok(match self.heads {
             Some(Heads::Linear) => config.with_linear_heads(),
-            // The presets' own kind.
-            Some(Heads::Dpt) | None => config,
+            Some(Heads::Own) | None => config,
         })
     }
 }

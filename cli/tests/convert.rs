@@ -60,9 +60,9 @@ fn heads_and_presets_are_chosen_by_flags() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("nano.sfw");
     let json = ok_json(&["init", "--heads", "linear", "--to", "f16", "-o", s(&out)]);
-    assert_eq!(json["parameters"], 11_817_876);
+    assert_eq!(json["parameters"], 4_262_546);
     assert_eq!(json["config"]["gs.kind"], "xdec_linear");
-    assert!(json["bytes"].as_u64().unwrap() < 3 * 11_817_876);
+    assert!(json["bytes"].as_u64().unwrap() < 3 * 4_262_546);
 }
 
 #[test]

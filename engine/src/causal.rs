@@ -70,6 +70,8 @@ pub(crate) struct Job<'a> {
     /// The last aggregator pair.
     pub(crate) last: Features<'a>,
     pub(crate) times: &'a [f64],
+    /// The image stem, for a guided motion head.
+    pub(crate) guide: &'a [f32],
     /// Raw motion maps, `[passes, frames, height, width, out]`.
     pub(crate) raw: &'a mut [f32],
     pub(crate) scratch: &'a mut [f32],
@@ -96,7 +98,7 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
         x.copy_from_slice(start);
         // A direction without a neighbour mirrors the other one: its map is never read, so only a tap wants it.
         let unread = config.render_extrapolate == Extrapolate::Mirror && bwd.is_some() && !probe.tapped();
-        let pass = Pass { net, d, tables, mask: mask(config, d, reach), blocks, reach, unread, name };
+        let pass = Pass { net, d, tables, guide: job.guide, mask: mask(config, d, reach), blocks, reach, unread, name };
         let shared = w.causal_back.is_none().then_some(&*shared);
         pass.layers(shared, x, tapped, scratch, probe)?;
         pass.motion(x, tapped, scratch, raw, probe)?;
@@ -135,6 +137,7 @@ struct Pass<'a> {
     net: Net<'a>,
     d: &'a Dims,
     tables: &'a Tables,
+    guide: &'a [f32],
     mask: FrameMask,
     blocks: &'a [Block],
     reach: Reach,
@@ -187,13 +190,14 @@ impl Pass<'_> {
             dims: d,
             tables: self.tables,
             dpt: self.tables.motion.as_ref(),
+            guide: self.guide,
             head,
             tokens: Tokens::Patches,
             name: "motion",
         };
         let features = |data| Features::dense(data, dim, d, self.mask.tokens);
         let source = match head {
-            DenseHead::Linear(_) => Source::Tokens(features(x)),
+            DenseHead::Linear(_) | DenseHead::Guided(_) => Source::Tokens(features(x)),
             DenseHead::Dpt(dpt) => {
                 let kept = taps(self.net.model);
                 Source::Taps(dpt.taps.map(|t| {

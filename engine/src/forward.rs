@@ -39,7 +39,7 @@ impl Memory {
     pub(crate) fn new(model: &Model, shape: ClipShape) -> Result<Memory> {
         let n = shape.frames;
         Ok(Memory {
-            output: Output::new(shape, model.config().conf.exists())?,
+            output: Output::new(shape, model.config().has_conf())?,
             cameras: vec![RawCamera::default(); n],
             raw_poses: vec![Pose::IDENTITY; n],
             fov: vec![0.0; 2 * n],
@@ -54,10 +54,20 @@ impl Memory {
 pub(crate) struct Areas<'a> {
     /// Kept features.
     pub(crate) pairs: &'a mut [f32],
+    /// The image stem; empty where no head is guided.
+    pub(crate) guide: &'a mut [f32],
     /// Raw motion maps; empty where the clip or the network has no motion.
     pub(crate) motion: &'a mut [f32],
     /// Working memory of the stage in progress.
     pub(crate) work: &'a mut [f32],
+}
+
+/// What dense heads on the aggregator read.
+#[derive(Clone, Copy)]
+struct Seen<'a> {
+    pairs: Pairs<'a>,
+    /// The image stem of all frames.
+    guide: &'a [f32],
 }
 
 /// Encodes one frame alone into `out`, `[tokens, dim]` with its register rows unset: the same bits as among
@@ -98,7 +108,7 @@ impl Forward<'_> {
         probe: &mut Probe,
     ) -> Result<()> {
         let d = &self.plan.dims;
-        let Areas { pairs, motion, work } = areas;
+        let Areas { pairs, guide, motion, work } = areas;
         memory.output.times.copy_from_slice(self.input.times);
         memory.output.flags = Flags { no_motion: motion.is_empty(), intrinsics_assumed: false };
         {
@@ -115,13 +125,16 @@ impl Forward<'_> {
         }
         let pairs =
             Pairs { data: pairs, kept: &self.plan.pairs, dims: &self.plan.dims, dim: self.config.aa.dim as usize };
+        heads::stem::run(self.net, d, self.input.images, (&mut *work, &mut *guide), probe)?;
+        let from = Seen { pairs, guide };
         self.poses(pairs, work, memory, probe)?;
-        self.depth(pairs, work, &mut memory.output, probe)?;
-        self.confidence(pairs, work, &mut memory.output, probe)?;
+        self.depth(from, work, &mut memory.output, probe)?;
+        self.confidence(from, work, &mut memory.output, probe)?;
         self.place(memory, probe)?;
-        self.gaussians(pairs, work, memory, probe)?;
+        self.gaussians(from, work, memory, probe)?;
         if !motion.is_empty() {
-            let job = causal::Job { last: pairs.final_pair(), times: self.input.times, raw: motion, scratch: work };
+            let (last, times) = (pairs.final_pair(), self.input.times);
+            let job = causal::Job { last, times, guide, raw: motion, scratch: work };
             causal::run(self.net, (d, self.tables), job, probe)?;
             self.velocities(motion, memory);
         }
@@ -159,20 +172,26 @@ impl Forward<'_> {
         name: &'static str,
         head: &'p DenseHead,
         dpt: Option<&'p DptTables>,
-        pairs: Pairs<'p>,
+        from: Seen<'p>,
     ) -> (Dense<'p>, Source<'p>) {
+        let Seen { pairs, guide } = from;
         let source = match head {
-            DenseHead::Linear(_) => Source::Tokens(self.last(pairs)),
+            DenseHead::Linear(_) | DenseHead::Guided(_) => Source::Tokens(self.last(pairs)),
             DenseHead::Dpt(dpt) => Source::Taps(dpt.taps.map(|t| pairs.get(t))),
         };
         let (net, dims, tables) = (self.net, &self.plan.dims, self.tables);
-        (Dense { net, dims, tables, dpt, head, tokens: Tokens::WithRegisters, name }, source)
+        (Dense { net, dims, tables, dpt, guide, head, tokens: Tokens::WithRegisters, name }, source)
     }
 
     /// Local points and depth, in the network's units until [`Forward::place`].
-    fn depth(&self, pairs: Pairs, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
+    fn depth(&self, from: Seen, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
         let d = &self.plan.dims;
-        let (dense, source) = self.dense("depth", &self.net.model.weights().depth, self.tables.depth.as_ref(), pairs);
+        let head = &self.net.model.weights().depth;
+        let (dense, source) = self.dense("depth", head, self.tables.depth.as_ref(), from);
+        // Depth and confidence lie side by side in a map of their own.
+        let both = if self.config.depth_map == DepthMap::ExpZConf { 2 * d.pixels() } else { 0 };
+        let need = heads::scratch_len(head, d, d.tokens, self.net.ctx.pool.threads());
+        let [raw, work] = carve(work, [both, need]);
         dense.prepare(source, work, probe)?;
         let pool = self.net.ctx.pool;
         for f in 0..d.frames {
@@ -198,16 +217,29 @@ impl Forward<'_> {
                     probe.guard(format_args!("depth"), depth)?;
                     probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 1], depth);
                 }
+                DepthMap::ExpZConf => {
+                    let conf = &mut out.conf[pixels];
+                    dense.frame(source, f, work, raw);
+                    pool.chunks(depth, d.width, &|v, row, _| {
+                        let raw = &raw[2 * v * d.width..][..2 * d.width];
+                        row.iter_mut().zip(raw.chunks_exact(2)).for_each(|(z, p)| *z = exp(p[0]));
+                    });
+                    conf.iter_mut().zip(raw.chunks_exact(2)).for_each(|(c, p)| *c = p[1]);
+                    probe.guard(format_args!("depth"), depth)?;
+                    probe.guard(format_args!("conf"), conf)?;
+                    probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 1], depth);
+                    probe.emit(format_args!("conf"), Some(f), &[d.height, d.width], conf);
+                }
             }
         }
         probe.lap("depth");
         Ok(())
     }
 
-    fn confidence(&self, pairs: Pairs, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
+    fn confidence(&self, from: Seen, work: &mut [f32], out: &mut Output, probe: &mut Probe) -> Result<()> {
         let d = &self.plan.dims;
         if let Some(head) = &self.net.model.weights().conf {
-            let (dense, source) = self.dense("conf", head, self.tables.conf.as_ref(), pairs);
+            let (dense, source) = self.dense("conf", head, self.tables.conf.as_ref(), from);
             dense.prepare(source, work, probe)?;
             for (f, conf) in out.conf.chunks_exact_mut(d.pixels()).enumerate() {
                 dense.frame(source, f, work, conf);
@@ -247,7 +279,7 @@ impl Forward<'_> {
         pool.chunks(&mut out.mean, d.width, &|row, mean, _| {
             views[row / d.height].mean_row(row % d.height, &depth[row * d.width..][..d.width], mean);
         });
-        if c.depth_map == DepthMap::ExpZ {
+        if c.depth_map != DepthMap::Pi3Point {
             pool.chunks(&mut out.points, d.width, &|row, points, _| {
                 let depth = &depth[row * d.width..][..d.width];
                 for (u, (p, &z)) in points.iter_mut().zip(depth).enumerate() {
@@ -261,7 +293,7 @@ impl Forward<'_> {
         Ok(())
     }
 
-    fn gaussians(&self, pairs: Pairs, work: &mut [f32], memory: &mut Memory, probe: &mut Probe) -> Result<()> {
+    fn gaussians(&self, from: Seen, work: &mut [f32], memory: &mut Memory, probe: &mut Probe) -> Result<()> {
         let d = &self.plan.dims;
         let Some(head) = &self.net.model.weights().gs else {
             for f in 0..d.frames {
@@ -270,7 +302,7 @@ impl Forward<'_> {
             probe.lap("gaussians");
             return Ok(());
         };
-        let (dense, source) = self.dense("gs", head, self.tables.gs.as_ref(), pairs);
+        let (dense, source) = self.dense("gs", head, self.tables.gs.as_ref(), from);
         let need = heads::scratch_len(head, d, d.tokens, self.net.ctx.pool.threads());
         let [raw, work] = carve(work, [d.pixels() * gaussians::CHANNELS, need]);
         dense.prepare(source, work, probe)?;

@@ -9,7 +9,7 @@
 //! | scale | 0.7 (z / f) exp(clamp(d, -4, 4)), f = (fx + fy) / 2 | 0.1 softplus d |
 //! | rotation | q_camera * normalise(q + (1, 0, 0, 0)) | normalise q, already world axes |
 //!
-//! Without a Gaussian head the residuals are zero, and where a confidence is under 0.1 the opacity is
+//! Without a Gaussian head the residuals are zero, and where a confidence is under `sky.conf` the opacity is
 //! zero. Every function maps one row of one frame, so rows can be shared out freely.
 
 use crate::rotation;
@@ -19,8 +19,6 @@ use sf_ops::{activation, trig};
 
 /// Channels of the Gaussian head.
 pub(crate) const CHANNELS: usize = 11;
-/// Confidence (sigmoid) under which a pixel counts as sky or edge, as public callers use it.
-pub const CONF_MIN: f32 = 0.1;
 
 /// One row of the head's output, or the priors.
 #[derive(Clone, Copy, Debug)]
@@ -46,6 +44,8 @@ pub(crate) struct Map {
     kind: GsMap,
     /// Scale prior per unit of depth: 0.7 / f.
     footprint: f32,
+    /// Confidence under which a pixel is left out where there is no Gaussian head.
+    conf_min: f32,
     /// Factor on scales that are not tied to the depth.
     world_scale: f32,
     /// Rotation of the frame's camera, w, x, y, z.
@@ -58,6 +58,7 @@ impl Map {
         Map {
             kind: if config.gs.exists() { config.gs_map } else { GsMap::Residual },
             footprint: (0.7 / ((view.k.fx + view.k.fy) / 2.0)) as f32,
+            conf_min: config.sky_conf as f32,
             world_scale: config.world_scale as f32,
             camera: rotation::quaternion(&view.pose.r).map(|v| v as f32),
         }
@@ -83,7 +84,7 @@ impl Map {
                 GsMap::Dggt => activation::sigmoid(o),
             };
             if let Raw::Priors(Some(conf)) = raw
-                && activation::sigmoid(conf[u]) < CONF_MIN
+                && activation::sigmoid(conf[u]) < self.conf_min
             {
                 *opacity = 0.0;
             }
@@ -140,7 +141,7 @@ mod tests {
 
     #[test]
     fn zero_residuals_are_the_priors() {
-        let map = Map::new(&ModelConfig::nano(), &view());
+        let map = Map::new(&ModelConfig::base(), &view());
         let raw = Raw::Head(&[0.0; CHANNELS]);
         let (mut colour, mut opacity) = ([[9.0; 3]], [9.0]);
         let (mut scale, mut quat) = ([[9.0; 3]], [[9.0; 4]]);
@@ -173,7 +174,7 @@ mod tests {
 
     #[test]
     fn dggt_quaternions_are_world_axes_and_zero_is_guarded() {
-        let mut config = ModelConfig::nano();
+        let mut config = ModelConfig::base();
         config.gs_map = GsMap::Dggt;
         let map = Map::new(&config, &view());
         let mut raw = [0.0; 2 * CHANNELS];

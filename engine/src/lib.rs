@@ -12,7 +12,7 @@
 //! | `aggregator.rs` | alternating frame and global attention |
 //! | `block.rs` | the one transformer block |
 //! | `features.rs` | the tokens that heads read, where they lie |
-//! | `heads/` | camera, linear and DPT heads |
+//! | `heads/` | camera, linear, guided and DPT heads |
 //! | `causal.rs` | the two masked passes over time |
 //! | `rotation.rs` `intrinsics.rs` `unproject.rs` | poses, focal lengths, centres |
 //! | `gaussians.rs` `motion.rs` | from raw channels to splats and velocities |
@@ -69,7 +69,6 @@ mod tables;
 mod unproject;
 
 pub use dims::{ClipShape, MAX_FRAMES, MAX_PIXELS, MAX_TOKENS};
-pub use gaussians::CONF_MIN;
 pub use input::Input;
 pub use model::Model;
 pub use output::{Flags, FrameSource, Output};

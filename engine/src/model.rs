@@ -112,11 +112,35 @@ pub(crate) struct LinearHead {
     pub(crate) out: usize,
 }
 
+/// Transformer decoder, linear layer to half resolution, convolutions beside the image stem.
+#[derive(Clone, Debug)]
+pub(crate) struct Guided {
+    pub(crate) decoder: Decoder,
+    pub(crate) proj: Linear, // [hidden (patch/2)^2, dim]
+    pub(crate) convs: [Linear; 4],
+    pub(crate) hidden: usize,
+    pub(crate) guide: usize,
+    pub(crate) features: usize,
+    pub(crate) out: usize,
+}
+
 /// A dense head.
 #[derive(Clone, Debug)]
 pub(crate) enum DenseHead {
     Linear(LinearHead),
+    Guided(Box<Guided>),
     Dpt(Box<Dpt>),
+}
+
+impl DenseHead {
+    /// The decoder of a head that has one.
+    pub(crate) fn decoder(&self) -> Option<&Decoder> {
+        match self {
+            DenseHead::Linear(h) => Some(&h.decoder),
+            DenseHead::Guided(h) => Some(&h.decoder),
+            DenseHead::Dpt(_) => None,
+        }
+    }
 }
 
 /// The camera decoder and head.
@@ -143,6 +167,8 @@ pub(crate) struct Weights {
     pub(crate) aa_time: Option<Linear>,      // [dim, d_t]
     pub(crate) aa: Vec<Block>,
     pub(crate) camera: Camera,
+    /// The image stem of guided heads: a 3x3 convolution, `[guide.channels, 27]`.
+    pub(crate) stem: Option<Linear>,
     pub(crate) depth: DenseHead,
     pub(crate) conf: Option<DenseHead>,
     pub(crate) gs: Option<DenseHead>,
@@ -349,7 +375,28 @@ impl Lookup<'_> {
         })
     }
 
-    /// `inputs` are the features of an `xdec_linear` head, `taps` those of a DPT head.
+    fn guided(&self, name: &str, inputs: usize, h: &Head) -> Result<Guided> {
+        let (hidden, features, out) = (h.hidden as usize, h.features as usize, h.out as usize);
+        let (dim, guide, half) = (h.dim as usize, self.config.guide_channels as usize, self.config.patch as usize / 2);
+        let conv = |i: usize, out: usize, inputs: usize| self.conv(&format!("{name}_head.conv.{i}"), out, inputs, 3);
+        let t = decoder_trunk(h.dim, h.depth, h.heads, h.eps);
+        Ok(Guided {
+            decoder: self.decoder(&format!("{name}_decoder"), inputs, &t, dim)?,
+            proj: self.linear(&format!("{name}_head.proj"), half * half * hidden, dim)?,
+            convs: [
+                conv(0, features, hidden + guide)?,
+                conv(1, features, features)?,
+                conv(2, features, features)?,
+                conv(3, 4 * out, features)?,
+            ],
+            hidden,
+            guide,
+            features,
+            out,
+        })
+    }
+
+    /// `inputs` are the features of a head with a decoder, `taps` those of a DPT head.
     fn head(&self, name: &str, inputs: usize, taps: usize, h: &Head) -> Result<Option<DenseHead>> {
         Ok(match h.kind {
             HeadKind::None | HeadKind::XdecConv => None,
@@ -362,6 +409,7 @@ impl Lookup<'_> {
                     out: h.out as usize,
                 }))
             }
+            HeadKind::Guided => Some(DenseHead::Guided(Box::new(self.guided(name, inputs, h)?))),
             HeadKind::Dpt => Some(DenseHead::Dpt(Box::new(self.dpt(&format!("{name}_head"), taps, h)?))),
         })
     }
@@ -410,6 +458,10 @@ impl Lookup<'_> {
             aa_time: if c.aa_time { Some(self.linear("aa_time", dim, c.time_dim as usize)?) } else { None },
             aa: self.trunk("decoder", &c.aa, BlockKind::Aa)?,
             camera: self.camera()?,
+            stem: match c.guide_channels {
+                0 => None,
+                n => Some(self.conv("image_stem", n as usize, 3, 3)?),
+            },
             depth: need(self.head("point", inputs, pair, &c.depth)?)?,
             conf: self.head("conf", inputs, pair, &c.conf)?,
             gs: self.head("gs", inputs, pair, &c.gs)?,

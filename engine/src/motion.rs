@@ -169,7 +169,7 @@ mod tests {
 
     #[test]
     fn reach_follows_the_mask_settings() {
-        let mut c = ModelConfig::nano();
+        let mut c = ModelConfig::base();
         assert_eq!(Reach::of(&c), (Reach { lo: 0, hi: 1 }, Some(Reach { lo: -1, hi: 0 })));
         c.mask_self = false;
         c.mask_k = 2;
@@ -184,7 +184,7 @@ mod tests {
 
     #[test]
     fn ends_mirror_and_a_lone_frame_stands_still() {
-        let c = ModelConfig::nano();
+        let c = ModelConfig::base();
         let raw = Raw::Passes(&[1.0, 2.0, 3.0, 0.0], &[-1.0, 0.0, 0.0, 4.0]);
         let run = |times: &[f64], f: usize| {
             let map = Map::new(&c, times, f, TURN);
@@ -206,7 +206,7 @@ mod tests {
 
     #[test]
     fn per_step_velocities_use_the_nearest_interval() {
-        let mut c = ModelConfig::nano();
+        let mut c = ModelConfig::base();
         c.motion_per = MotionPer::Step;
         c.motion_frame = MotionFrame::World;
         c.motion_back_sign = -1;

@@ -2,7 +2,6 @@
 
 use crate::arena::filled;
 use crate::dims::ClipShape;
-use crate::gaussians::CONF_MIN;
 use sf_formats::config::{ModelConfig, Sky};
 use sf_formats::scene::{Compose, SceneFrame, SplatSettings};
 use sf_formats::{Camera, Gaussians, Intrinsics, Pose, Result, Scene};
@@ -11,7 +10,7 @@ use sf_ops::activation::sigmoid;
 /// f32 values of an [`Output`] per pixel of the clip: points, depth, centre, scale, quaternion, opacity, colour,
 /// two velocities, dynamic probability; and the confidence where there is one.
 pub(crate) fn values_per_pixel(config: &ModelConfig) -> usize {
-    3 + 1 + 3 + 3 + 4 + 1 + 3 + 3 + 3 + 1 + usize::from(config.conf.exists())
+    3 + 1 + 3 + 3 + 4 + 1 + 3 + 3 + 3 + 1 + usize::from(config.has_conf())
 }
 
 /// What a caller should know about a result.
@@ -141,7 +140,7 @@ impl Output {
             notes: Vec::new(),
         };
         if config.sky == Sky::FarShell {
-            self.push_sky(&mut scene, pixels);
+            self.push_sky(&mut scene, pixels, config.sky_conf as f32);
         }
         if config.static_voxel > 0.0 {
             merge_static(&mut scene, config.static_voxel, config.motion_tau as f32);
@@ -151,8 +150,8 @@ impl Output {
 
     /// Pixels of low confidence go to a shell at twice the largest confident depth, along their rays, and
     /// stand still there; without confidences nothing happens.
-    fn push_sky(&self, scene: &mut Scene, pixels: usize) {
-        let sky = |i: usize| self.conf.get(i).is_some_and(|&c| sigmoid(c) < CONF_MIN);
+    fn push_sky(&self, scene: &mut Scene, pixels: usize, least: f32) {
+        let sky = |i: usize| self.conf.get(i).is_some_and(|&c| sigmoid(c) < least);
         let land = (0..self.depth.len()).filter(|&i| !sky(i)).map(|i| self.depth[i]).fold(0.0, f32::max);
         if land <= 0.0 {
             return;
@@ -242,16 +241,16 @@ mod tests {
 
     #[test]
     fn all_pixels_become_gaussians() {
-        let scene = output().to_scene(&ModelConfig::nano(), &[]);
+        let scene = output().to_scene(&ModelConfig::base(), &[]);
         assert_eq!((scene.len(), scene.frames.len(), scene.frames[0].source_size), (4, 1, (4, 1)));
         let source = FrameSource { name: "a.png".into(), size: (40, 10) };
-        let scene = output().to_scene(&ModelConfig::nano(), &[source]);
+        let scene = output().to_scene(&ModelConfig::base(), &[source]);
         assert_eq!((scene.frames[0].name.as_str(), scene.frames[0].source_size), ("a.png", (40, 10)));
     }
 
     #[test]
     fn static_gaussians_of_a_voxel_merge_and_dynamic_ones_stay() {
-        let config = ModelConfig { static_voxel: 1.0, ..ModelConfig::nano() };
+        let config = ModelConfig { static_voxel: 1.0, ..ModelConfig::base() };
         let scene = output().to_scene(&config, &[]);
         // Two static ones share the voxel (0, 0, 1): one is left; the dynamic one there stays.
         assert_eq!(scene.dynamic, [0.1, 0.9, 0.0]);
@@ -262,12 +261,17 @@ mod tests {
 
     #[test]
     fn sky_goes_to_the_shell() {
-        let config = ModelConfig { sky: Sky::FarShell, ..ModelConfig::nano() };
+        let config = ModelConfig { sky: Sky::FarShell, ..ModelConfig::base() };
         let scene = output().to_scene(&config, &[]);
         // Largest confident depth 1.2, shell at 2.4, sky was at 2.
         let m = scene.gaussians.mean[3];
         assert!((m[1] - 1.2).abs() < 1e-6 && (m[2] - 2.4).abs() < 1e-6, "{m:?}");
         assert!((scene.gaussians.scale[3][0] - 0.12).abs() < 1e-6);
         assert_eq!(scene.gaussians.mean[0], [0.1, 0.1, 1.0]);
+        // The threshold is a setting: sigmoid(3) is 0.953.
+        let nothing = ModelConfig { sky_conf: 0.001, ..config.clone() };
+        assert_eq!(output().to_scene(&nothing, &[]).gaussians.mean[3], output().mean[3]);
+        let most = ModelConfig { sky_conf: 0.96, ..config };
+        assert_eq!(output().to_scene(&most, &[]).gaussians.mean, output().mean, "no land to measure the shell by");
     }
 }

@@ -3,6 +3,7 @@
 //! | area | lives | holds |
 //! |---|---|---|
 //! | pairs | from the aggregator to the end | the frame and global features that heads read |
+//! | guide | the image stem to the motion passes | what guided heads see of the images |
 //! | motion | motion passes to the end | raw motion maps |
 //! | work | one stage | working memory of the stage in progress |
 //!
@@ -16,7 +17,7 @@ use crate::dims::{ClipShape, Dims};
 use crate::gaussians;
 use crate::heads;
 use crate::model::{DenseHead, Model};
-use sf_formats::config::{Head, HeadKind, ModelConfig, MotionLayout};
+use sf_formats::config::{DepthMap, Head, HeadKind, ModelConfig, MotionLayout};
 use sf_formats::{Error, Result};
 use sf_ops::attention::FrameMask;
 use std::fmt;
@@ -30,8 +31,8 @@ pub struct Plan {
     pub(crate) dims: Dims,
     /// Aggregator pairs whose features are kept, ascending.
     pub(crate) pairs: Vec<usize>,
-    /// Values of all kept pairs, of the raw motion maps, of the working memory.
-    pub(crate) areas: [usize; 3],
+    /// Values of all kept pairs, of the image stem, of the raw motion maps, of the working memory.
+    pub(crate) areas: [usize; 4],
     stages: Vec<(&'static str, usize)>,
     output_values: usize,
     layers: u32,
@@ -59,8 +60,12 @@ impl Plan {
         let dim = config.aa.dim as usize;
         let mut stages = vec![("encoder + aggregator", carved_len(trunk_lens(model, &dims, threads)))];
         stages.push(("camera", heads::camera::scratch_len(&w.camera, &dims, threads)));
+        if w.stem.is_some() {
+            stages.push(("image stem", heads::stem::scratch_len(&dims)));
+        }
         let raw = dims.pixels() * gaussians::CHANNELS;
-        let dense = [("depth", Some(&w.depth), 0), ("conf", w.conf.as_ref(), 0), ("gaussians", w.gs.as_ref(), raw)];
+        let both = if config.depth_map == DepthMap::ExpZConf { 2 * dims.pixels() } else { 0 };
+        let dense = [("depth", Some(&w.depth), both), ("conf", w.conf.as_ref(), 0), ("gaussians", w.gs.as_ref(), raw)];
         for (name, head, raw) in dense {
             if let Some(head) = head {
                 stages.push((name, carved_len([raw, heads::scratch_len(head, &dims, dims.tokens, threads)])));
@@ -72,7 +77,8 @@ impl Plan {
             motion = causal::raw_values(config, &dims);
         }
         let work = stages.iter().map(|s| s.1).max().unwrap_or(0);
-        let areas = [pairs.len() * n * dims.tokens * 2 * dim, motion, work];
+        let guide = heads::stem::values(w.stem.as_ref(), &dims);
+        let areas = [pairs.len() * n * dims.tokens * 2 * dim, guide, motion, work];
         let plan = Plan {
             dims,
             pairs,
@@ -122,7 +128,7 @@ impl Plan {
 
 /// Transformer blocks that a run of `frames` frames goes through; a causal block counts once per pass.
 fn layers(config: &ModelConfig, frames: usize) -> u32 {
-    let head = |h: &Head| if h.kind == HeadKind::XdecLinear { h.depth } else { 0 };
+    let head = |h: &Head| if matches!(h.kind, HeadKind::XdecLinear | HeadKind::Guided) { h.depth } else { 0 };
     let passes = if config.motion_layout == MotionLayout::PerDirection { 2 } else { 1 };
     let motion =
         if config.has_motion() && frames > 1 { passes * (config.causal_depth + head(&config.motion)) } else { 0 };
@@ -145,8 +151,9 @@ impl fmt::Display for Plan {
         )?;
         writeln!(f, "arena       {:9.2} MiB", self.arena_bytes() as f64 / f64::from(1 << 20))?;
         writeln!(f, "  pairs     {:9.2} MiB (kept: {:?})", mib(self.areas[0]), self.pairs)?;
-        writeln!(f, "  motion    {:9.2} MiB", mib(self.areas[1]))?;
-        writeln!(f, "  work      {:9.2} MiB, the largest of", mib(self.areas[2]))?;
+        writeln!(f, "  guide     {:9.2} MiB", mib(self.areas[1]))?;
+        writeln!(f, "  motion    {:9.2} MiB", mib(self.areas[2]))?;
+        writeln!(f, "  work      {:9.2} MiB, the largest of", mib(self.areas[3]))?;
         for (name, values) in &self.stages {
             writeln!(f, "    {:9.2} MiB {name}", mib(*values))?;
         }

@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn frames_are_resized_with_their_intrinsics() {
-        let config = ModelConfig::nano();
+        let config = ModelConfig::base();
         let rgb = vec![90u8; 60 * 40 * 3];
         let frame = SourceFrame { width: 60, height: 40, rgb: &rgb, name: "a" };
         let k = Intrinsics { fx: 30.0, fy: 30.0, cx: 30.0, cy: 20.0 };
@@ -199,7 +199,7 @@ mod tests {
 
     #[test]
     fn normalisation_is_the_definition() {
-        let config = ModelConfig::nano();
+        let config = ModelConfig::base();
         let mut out = [0.0; 3];
         Normaliser::new(&config).apply(&[0, 128, 255], &mut out);
         for c in 0..3 {

@@ -217,13 +217,13 @@ impl Session {
         deadline: Option<Instant>,
         taps: Option<TapFn>,
     ) -> Result<()> {
-        let [pairs, motion, work] = carve(self.arena.all(), self.plan.areas);
+        let [pairs, guide, motion, work] = carve(self.arena.all(), self.plan.areas);
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline };
         let mut probe = Probe::new(taps, watch, &mut self.times);
         self.complete = false;
-        forward.run(Areas { pairs, motion, work }, encoded, &mut self.memory, &mut probe)?;
+        forward.run(Areas { pairs, guide, motion, work }, encoded, &mut self.memory, &mut probe)?;
         self.complete = true;
         Ok(())
     }
@@ -277,7 +277,7 @@ impl Session {
     }
 
     fn encode(&mut self, image: &[u8], window: &mut Window) -> Result<()> {
-        let [_, _, work] = carve(self.arena.all(), self.plan.areas);
+        let [_, _, _, work] = carve(self.arena.all(), self.plan.areas);
         let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline: None };
         let mut probe = Probe::new(None, watch, &mut self.times);

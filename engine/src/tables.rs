@@ -67,15 +67,15 @@ impl Tables {
             tables.add(c, d, block.dim / block.heads, Tokens::WithRegisters);
         }
         for head in [Some(&w.depth), w.conf.as_ref(), w.gs.as_ref()].into_iter().flatten() {
-            if let DenseHead::Linear(head) = head {
-                head.decoder.blocks.iter().for_each(|b| tables.add(c, d, b.dim / b.heads, Tokens::WithRegisters));
+            if let Some(decoder) = head.decoder() {
+                decoder.blocks.iter().for_each(|b| tables.add(c, d, b.dim / b.heads, Tokens::WithRegisters));
             }
         }
         for block in &w.causal {
             tables.add(c, d, block.dim / block.heads, causal_tokens(c));
         }
-        if let Some(DenseHead::Linear(head)) = &w.motion {
-            head.decoder.blocks.iter().for_each(|b| tables.add(c, d, b.dim / b.heads, Tokens::Patches));
+        if let Some(decoder) = w.motion.as_ref().and_then(DenseHead::decoder) {
+            decoder.blocks.iter().for_each(|b| tables.add(c, d, b.dim / b.heads, Tokens::Patches));
         }
         tables
     }

@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn the_first_camera_is_the_world() {
-        let mut config = ModelConfig::nano();
+        let mut config = ModelConfig::base();
         config.world_scale = 2.0;
         let a = Pose { r: DMat3::from_rotation_y(0.4), t: DVec3::new(1.0, 2.0, 3.0) };
         let b = Pose { r: DMat3::from_rotation_x(0.2), t: DVec3::new(1.0, 2.0, 4.0) };

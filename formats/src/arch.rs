@@ -2,7 +2,7 @@
 //!
 //! One list serves everything that must agree: seeded initialisation, checkpoint conversion, blob
 //! validation and the engine's lookup. Names are Pi3's public names for what Pi3 has; ours are
-//! `gs_*`, `causal.*`, `motion_*` and `aa_time`, with VGGT's DPT names inside DPT heads.
+//! `gs_*`, `causal.*`, `motion_*`, `aa_time` and `image_stem`, with VGGT's DPT names inside DPT heads.
 
 use crate::config::{Head, HeadKind, KSource, ModelConfig, Trunk};
 
@@ -150,11 +150,25 @@ impl List {
         self.conv(&format!("{s}.output_conv2.2"), h.out, h.hidden, 1, true);
     }
 
-    fn head(&mut self, name: &str, inp: u32, patch: u32, h: &Head) {
+    fn guided(&mut self, name: &str, patch: u32, guide: u32, h: &Head) {
+        let half = patch / 2;
+        self.linear(&format!("{name}_head.proj"), half * half * h.hidden, h.dim);
+        let f = h.features;
+        let widths = [(f, h.hidden + guide), (f, f), (f, f), (4 * h.out, f)];
+        for (i, (out, inp)) in widths.into_iter().enumerate() {
+            self.conv(&format!("{name}_head.conv.{i}"), out, inp, 3, true);
+        }
+    }
+
+    fn head(&mut self, name: &str, inp: u32, c: &ModelConfig, h: &Head) {
         match h.kind {
             HeadKind::XdecLinear => {
                 self.decoder(&format!("{name}_decoder"), inp, h.dim, h.depth, h.heads, h.dim);
-                self.linear(&format!("{name}_head.proj"), patch * patch * h.out, h.dim);
+                self.linear(&format!("{name}_head.proj"), c.patch * c.patch * h.out, h.dim);
+            }
+            HeadKind::Guided => {
+                self.decoder(&format!("{name}_decoder"), inp, h.dim, h.depth, h.heads, h.dim);
+                self.guided(name, c.patch, c.guide_channels, h);
             }
             HeadKind::Dpt => self.dpt(&format!("{name}_head"), inp, h),
             HeadKind::None | HeadKind::XdecConv => {}
@@ -204,9 +218,12 @@ pub fn tensors(config: &ModelConfig) -> Vec<TensorSpec> {
         l.linear("camera_head.fc_fov", 2, w);
     }
 
-    l.head("point", wide(&c.depth), c.patch, &c.depth);
-    l.head("conf", wide(&c.conf), c.patch, &c.conf);
-    l.head("gs", wide(&c.gs), c.patch, &c.gs);
+    if c.guide_channels > 0 {
+        l.conv("image_stem", c.guide_channels, 3, 3, true);
+    }
+    l.head("point", wide(&c.depth), c, &c.depth);
+    l.head("conf", wide(&c.conf), c, &c.conf);
+    l.head("gs", wide(&c.gs), c, &c.gs);
 
     let dc = c.causal_dim();
     let sets: &[&str] = if c.causal_share { &["causal"] } else { &["causal", "causal_back"] };
@@ -215,7 +232,7 @@ pub fn tensors(config: &ModelConfig) -> Vec<TensorSpec> {
             l.block(&format!("{set}.{i}"), dc, c.causal_heads, 4, true, true);
         }
     }
-    l.head("motion", dc, c.patch, &c.motion);
+    l.head("motion", dc, c, &c.motion);
     l.0
 }
 
@@ -265,16 +282,35 @@ mod tests {
         assert_eq!(parameters(&base), 113_829_016);
         assert_eq!(count(&base, &["camera_"]), 8_021_132);
         assert_eq!(parameters(&ModelConfig { conf: Head::none(), ..base }), 106_212_564);
-        let nano = ModelConfig::nano().with_linear_heads();
-        assert_eq!(parameters(&nano), 11_817_876);
-        assert_eq!(count(&nano, &["encoder."]), 2_835_264);
-        assert_eq!(count(&nano, &["causal."]), 2_422_784);
+    }
+
+    /// The trained network, part by part; each count is also the PyTorch model's.
+    #[test]
+    fn nano_has_its_guided_heads() {
+        let nano = ModelConfig::nano();
+        let stem = 16 * 3 * 9 + 16;
+        assert_eq!(count(&nano, &["image_stem"]), stem);
+        // 24 channels for each of 7 x 7 half-resolution pixels, then the four convolutions.
+        let head = |out: usize| {
+            let linear = 128 * 1176 + 1176;
+            linear + (40 * 9 + 1) * 32 + 2 * (32 * 9 + 1) * 32 + (32 * 9 + 1) * 4 * out
+        };
+        for (name, out) in [("point_head.", 2), ("gs_head.", 11), ("motion_head.", 4)] {
+            assert_eq!(count(&nano, &[name]), head(out), "{name}");
+        }
+        assert_eq!(count(&nano, &["encoder."]), 903_296);
+        assert_eq!(count(&nano, &["decoder."]), 1_192_704);
+        assert_eq!(count(&nano, &["causal."]), 619_520);
+        assert_eq!(parameters(&nano), 4_398_074);
+        let linear = nano.with_linear_heads();
+        linear.check("nano").unwrap();
+        assert_eq!(count(&linear, &["image_stem"]), 0);
     }
 
     /// Self-check 2: layer scales and q/k norms stand exactly where they belong.
     #[test]
     fn gammas_and_qk_norms_are_where_they_belong() {
-        for config in [ModelConfig::full(), ModelConfig::full().with_linear_heads(), ModelConfig::nano()] {
+        for config in [ModelConfig::full(), ModelConfig::base().with_linear_heads(), ModelConfig::nano()] {
             for t in tensors(&config) {
                 let trunk = ["encoder.blocks.", "decoder.", "causal."].iter().any(|p| t.name.starts_with(p));
                 let qk = ["decoder.", "causal."].iter().any(|p| t.name.starts_with(p));

@@ -36,23 +36,24 @@ pub struct Head {
     pub kind: HeadKind,
     /// Output channels per pixel.
     pub out: u32,
-    /// `xdec_linear`: decoder width.
+    /// `xdec_linear`, `guided`: decoder width.
     pub dim: u32,
-    /// `xdec_linear`: decoder blocks.
+    /// `xdec_linear`, `guided`: decoder blocks.
     pub depth: u32,
-    /// `xdec_linear`: attention heads.
+    /// `xdec_linear`, `guided`: attention heads.
     pub heads: u32,
     /// `dpt`: the four layers read, 0-based alternating-attention pairs (or causal layers).
     pub taps: Vec<u32>,
     /// `dpt`: channels of the four tap projections.
     pub channels: Vec<u32>,
-    /// `dpt`: width of the fusion pyramid.
+    /// `dpt`: width of the fusion pyramid; `guided`: width of the convolutions.
     pub features: u32,
-    /// `dpt`: channels before the last 1x1 convolution.
+    /// `dpt`: channels before the last 1x1 convolution; `guided`: channels per half-resolution pixel of the
+    /// linear layer.
     pub hidden: u32,
     /// `dpt`: skip path of the residual units.
     pub rcu_skip: RcuSkip,
-    /// `dpt`: epsilon of the token norm.
+    /// Epsilon of the norms: `dpt` of the token norm, others of the decoder's blocks.
     pub eps: f64,
     /// `dpt`: image shortcut.
     pub image_merger: ImageMerger,
@@ -102,6 +103,9 @@ pub struct ModelConfig {
     pub camera_k: KSource,
     /// Pixel-centre convention of unprojection.
     pub camera_pixel: PixelCentre,
+
+    /// Channels of the image stem that all `guided` heads share; 0 without such heads.
+    pub guide_channels: u32,
 
     /// Depth (point) head.
     pub depth: Head,
@@ -174,6 +178,8 @@ pub struct ModelConfig {
     pub static_voxel: f64,
     /// Sky treatment.
     pub sky: Sky,
+    /// Confidence (sigmoid) under which a pixel counts as sky: `sky.mode`, and the opacity without a Gaussian head.
+    pub sky_conf: f64,
 
     /// Rasterizer: antialiased opacity compensation.
     pub splat_aa: bool,
@@ -240,6 +246,11 @@ impl Head {
         Head { kind: HeadKind::XdecLinear, out, dim, depth, heads, eps: 1e-6, ..Head::none() }
     }
 
+    /// A decoder, then convolutions guided by the image: `hidden` channels per half-resolution pixel, `features` wide.
+    pub fn guided(out: u32, (dim, depth, heads): (u32, u32, u32), hidden: u32, features: u32) -> Head {
+        Head { kind: HeadKind::Guided, out, dim, depth, heads, hidden, features, eps: 1e-6, ..Head::none() }
+    }
+
     /// VGGT's kind: a pyramid over four taps.
     pub fn dpt(out: u32, taps: [u32; 4], channels: [u32; 4], features: u32) -> Head {
         Head {
@@ -280,6 +291,7 @@ impl ModelConfig {
         v.field("camera.width", &mut self.camera_width)?;
         v.field("camera.k", &mut self.camera_k)?;
         v.field("camera.pixel", &mut self.camera_pixel)?;
+        v.field("guide.channels", &mut self.guide_channels)?;
         self.depth.visit("depth", v)?;
         v.field("depth.out_map", &mut self.depth_map)?;
         self.conf.visit("conf", v)?;
@@ -313,6 +325,7 @@ impl ModelConfig {
         v.field("render.split", &mut self.render_split)?;
         v.field("static.voxel", &mut self.static_voxel)?;
         v.field("sky.mode", &mut self.sky)?;
+        v.field("sky.conf", &mut self.sky_conf)?;
         v.field("splat.aa", &mut self.splat_aa)?;
         v.field("splat.a_max", &mut self.splat_a_max)?;
         v.field("splat.eps2d", &mut self.splat_eps2d)?;
@@ -441,6 +454,16 @@ impl ModelConfig {
             }
     }
 
+    /// The depth, confidence, Gaussian and motion head with their key prefixes.
+    pub fn dense_heads(&self) -> [(&'static str, &Head); 4] {
+        [("depth", &self.depth), ("conf", &self.conf), ("gs", &self.gs), ("motion", &self.motion)]
+    }
+
+    /// Whether the network predicts confidences, by a head of their own or beside the depth.
+    pub fn has_conf(&self) -> bool {
+        self.conf.exists() || self.depth_map == DepthMap::ExpZConf
+    }
+
     /// Whether the network predicts motion.
     pub fn has_motion(&self) -> bool {
         self.causal_depth > 0 && self.motion.exists()
@@ -473,6 +496,27 @@ mod tests {
         assert_eq!(e.status() as i32, 4);
         let e = ModelConfig::from_json(r#"{"depth.kind": "xdec_conv"}"#, "f").unwrap_err();
         assert_eq!(e.status() as i32, 7);
+    }
+
+    #[test]
+    fn guided_heads_and_their_stem_go_together() {
+        let refused = |why: &str, change: &dyn Fn(&mut ModelConfig)| {
+            let mut config = ModelConfig::nano();
+            change(&mut config);
+            let e = config.check("f").unwrap_err().to_string();
+            assert!(e.contains(why), "{e}");
+        };
+        refused("guide.channels = 0 must be 1..256", &|c| c.guide_channels = 0);
+        refused("patch = 7 must be even", &|c| c.patch = 7);
+        refused("gs.hidden = 0", &|c| c.gs.hidden = 0);
+        refused("motion.features = 2000", &|c| c.motion.features = 2000);
+        refused("depth.out = 1 must be 2", &|c| c.depth.out = 1);
+        refused("camera.k must be fov", &|c| c.camera_k = KSource::FitShared);
+        refused("conf.kind must be none", &|c| c.conf = Head::xdec_linear(1, 16, 1, 1));
+        let e = ModelConfig { guide_channels: 8, ..ModelConfig::base() }.check("f").unwrap_err();
+        assert!(e.to_string().contains("no head is guided"), "{e}");
+        let e = ModelConfig { sky_conf: 1.5, ..ModelConfig::base() }.check("f").unwrap_err();
+        assert!(e.to_string().contains("sky.conf"), "{e}");
     }
 
     #[test]

@@ -33,14 +33,18 @@ impl ModelConfig {
         range("camera.depth", self.camera_depth, 0, 64)?;
         range("camera.width", self.camera_width, 4, 8192)?;
         self.heads(at, "camera", self.camera_dim, self.camera_heads)?;
-        for (p, h) in [("depth", &self.depth), ("conf", &self.conf), ("gs", &self.gs), ("motion", &self.motion)] {
+        for (p, h) in self.dense_heads() {
             match h.kind {
                 HeadKind::None => {}
-                HeadKind::XdecLinear => {
+                HeadKind::XdecLinear | HeadKind::Guided => {
                     range(&format!("{p}.out"), h.out, 1, 64)?;
                     range(&format!("{p}.dim"), h.dim, 4, 8192)?;
                     range(&format!("{p}.depth"), h.depth, 0, 64)?;
                     self.heads(at, p, h.dim, h.heads)?;
+                    if h.kind == HeadKind::Guided {
+                        range(&format!("{p}.hidden"), h.hidden, 1, 1024)?;
+                        range(&format!("{p}.features"), h.features, 1, 1024)?;
+                    }
                 }
                 HeadKind::Dpt => {
                     range(&format!("{p}.out"), h.out, 1, 64)?;
@@ -63,10 +67,20 @@ impl ModelConfig {
                 HeadKind::XdecConv => {
                     return Err(Error::unsupported(
                         at,
-                        format!("{p}.kind = xdec_conv (Pi3X) is known but not executed; supported: xdec_linear, dpt"),
+                        format!(
+                            "{p}.kind = xdec_conv (Pi3X) is known but not executed; supported: xdec_linear, dpt, guided"
+                        ),
                     ));
                 }
             }
+        }
+        if self.dense_heads().iter().any(|(_, h)| h.kind == HeadKind::Guided) {
+            range("guide.channels", self.guide_channels, 1, 256)?;
+            if !self.patch.is_multiple_of(2) {
+                return bad(format!("patch = {} must be even: guided heads work at half resolution", self.patch));
+            }
+        } else if self.guide_channels != 0 {
+            return bad(format!("guide.channels = {} must be 0: no head is guided", self.guide_channels));
         }
         if !self.depth.exists() {
             return bad("depth.kind = none: a network without depth has no scene".into());
@@ -74,12 +88,16 @@ impl ModelConfig {
         let want = match self.depth_map {
             DepthMap::Pi3Point => 3,
             DepthMap::ExpZ => 1,
+            DepthMap::ExpZConf => 2,
         };
         if self.depth.out != want {
             return bad(format!("depth.out = {} must be {want} for this depth.out_map", self.depth.out));
         }
-        if self.depth_map == DepthMap::ExpZ && self.camera_k != KSource::Fov {
-            return bad("depth.out_map = exp_z has no rays to fit K from: camera.k must be fov".into());
+        if self.depth_map != DepthMap::Pi3Point && self.camera_k != KSource::Fov {
+            return bad("depth.out_map = exp_z or exp_z_conf has no rays to fit K from: camera.k must be fov".into());
+        }
+        if self.depth_map == DepthMap::ExpZConf && self.conf.exists() {
+            return bad("depth.out_map = exp_z_conf predicts the confidence: conf.kind must be none".into());
         }
         if self.conf.exists() && self.conf.out != 1 {
             return bad(format!("conf.out = {} must be 1", self.conf.out));
@@ -128,6 +146,7 @@ impl ModelConfig {
             ("motion.tau", self.motion_tau, 0.0, 1.0),
             ("world.scale", self.world_scale, 1e-9, 1e9),
             ("static.voxel", self.static_voxel, 0.0, 1e6),
+            ("sky.conf", self.sky_conf, 0.0, 1.0),
             ("splat.a_max", self.splat_a_max, 0.1, 0.9999),
             ("splat.eps2d", self.splat_eps2d, 0.0, 16.0),
             ("splat.near", self.splat_near, 1e-6, 1e3),

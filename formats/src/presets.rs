@@ -26,6 +26,7 @@ impl ModelConfig {
             camera_width: 512,
             camera_k: KSource::FitShared,
             camera_pixel: PixelCentre::Half,
+            guide_channels: 0,
             depth: Head::xdec_linear(3, 1024, 5, 16),
             depth_map: DepthMap::Pi3Point,
             conf: Head::xdec_linear(1, 1024, 5, 16),
@@ -59,6 +60,7 @@ impl ModelConfig {
             render_split: Split::Hard,
             static_voxel: 0.0,
             sky: Sky::None,
+            sky_conf: 0.1,
             splat_aa: false,
             splat_a_max: 0.999,
             splat_eps2d: 0.3,
@@ -85,22 +87,35 @@ impl ModelConfig {
         }
     }
 
-    /// 12 M parameters, for demonstrations, tests and small machines.
+    /// 4.4 M parameters, for demonstrations, tests and small machines: the network that is trained on synthetic
+    /// streets. All heads are guided; depth comes with a sky confidence, intrinsics from the camera head, and
+    /// both motion passes predict the same metric velocity.
     pub fn nano() -> ModelConfig {
+        let head = |out| Head::guided(out, (128, 1, 2), 24, 32);
         ModelConfig {
-            encoder: Trunk { dim: 192, depth: 6, heads: 3, ..Self::full().encoder },
+            encoder: Trunk { dim: 128, depth: 4, heads: 2, ..Self::full().encoder },
             pos_grid: 16,
-            aa: Trunk { dim: 192, depth: 8, heads: 3, ..Self::full().aa },
-            camera_dim: 192,
+            aa: Trunk { dim: 128, depth: 6, heads: 2, ..Self::full().aa },
+            aa_time: true,
+            camera_dim: 128,
             camera_depth: 1,
-            camera_heads: 3,
+            camera_heads: 2,
             camera_width: 128,
-            depth: Head::xdec_linear(3, 192, 1, 3),
+            camera_k: KSource::Fov,
+            guide_channels: 16,
+            depth: head(2),
+            depth_map: DepthMap::ExpZConf,
             conf: Head::none(),
-            gs: Head::dpt(11, [0, 1, 2, 3], [32, 64, 96, 192], 48),
+            gs: head(11),
             time_dim: 32,
+            causal_depth: 2,
             causal_heads: 4,
-            motion: Head::dpt(4, [0, 1, 2, 3], [32, 64, 96, 192], 48),
+            motion: head(4),
+            motion_back_sign: -1,
+            motion_scale: 5.0,
+            motion_bias: -2.0,
+            sky: Sky::FarShell,
+            sky_conf: 0.5,
             ..Self::full()
         }
     }
@@ -129,13 +144,15 @@ impl ModelConfig {
         }
     }
 
-    /// The same network with every dense head of the `xdec_linear` kind.
+    /// The same network with every dense head of the `xdec_linear` kind, of the depth head's sizes.
     pub fn with_linear_heads(mut self) -> ModelConfig {
-        for head in [&mut self.gs, &mut self.motion] {
-            if head.exists() {
-                *head = Head::xdec_linear(head.out, self.depth.dim, self.depth.depth, self.depth.heads);
+        let (dim, depth, heads) = (self.depth.dim, self.depth.depth, self.depth.heads);
+        for head in [&mut self.depth, &mut self.conf, &mut self.gs, &mut self.motion] {
+            if head.exists() && head.kind != HeadKind::XdecLinear {
+                *head = Head::xdec_linear(head.out, dim, depth, heads);
             }
         }
+        self.guide_channels = 0;
         self
     }
 }

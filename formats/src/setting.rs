@@ -172,6 +172,8 @@ choice! {
         XdecConv = "xdec_conv",
         /// Four-tap convolutional pyramid (VGGT's DPT head).
         Dpt = "dpt",
+        /// Transformer decoder, then 3x3 convolutions at half resolution that also see the image.
+        Guided = "guided",
     }
 }
 choice! {
@@ -190,6 +192,8 @@ choice! {
         Pi3Point = "pi3_point",
         /// One channel l: z = exp(l), rays from K.
         ExpZ = "exp_z",
+        /// Channels (l, c): z = exp(l), rays from K; c is the confidence logit.
+        ExpZConf = "exp_z_conf",
     }
 }
 choice! {
@@ -308,7 +312,7 @@ choice! {
     Sky {
         /// Ordinary static Gaussians.
         None = "none",
-        /// Pixels with confidence under 0.1 are pushed to a far shell.
+        /// Pixels with confidence under `sky.conf` are pushed to a far shell.
         FarShell = "far_shell",
     }
 }

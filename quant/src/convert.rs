@@ -186,7 +186,7 @@ fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Repo
         let dtype = match (spec.matrix(), kept) {
             (None, _) => Dtype::F32,
             (Some(_), Some(k)) => options.keep[k].1,
-            (Some(_), None) if is_sensitive(&spec.name) => Dtype::F32,
+            (Some(_), None) if is_sensitive(&config, &spec.name) => Dtype::F32,
             (Some(_), None) => options.precision,
         };
         tensors.push(TensorReport {
@@ -225,8 +225,8 @@ fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Repo
 }
 
 /// Whether a matrix stays f32 by default.
-fn is_sensitive(name: &str) -> bool {
-    name.starts_with("camera_head.") || output_layer(name).is_some()
+fn is_sensitive(config: &ModelConfig, name: &str) -> bool {
+    name.starts_with("camera_head.") || output_layer(config, name).is_some()
 }
 
 /// The checkpoint's own configuration, else the caller's, else what names and shapes say.

@@ -70,7 +70,12 @@ pub(crate) fn detect(tensors: &[CheckpointTensor], names: &Names, at: &str) -> R
         camera_heads: camera_dim / HEAD_WIDTH,
         camera_width: s.size("camera_decoder.linear_out.weight", 0)?,
         camera_k: if s.has("camera_head.fc_fov.") { KSource::Fov } else { base.camera_k },
-        depth_map: if depth.out == 1 { DepthMap::ExpZ } else { DepthMap::Pi3Point },
+        depth_map: match depth.out {
+            1 => DepthMap::ExpZ,
+            2 => DepthMap::ExpZConf,
+            _ => DepthMap::Pi3Point,
+        },
+        guide_channels: s.optional("image_stem.weight", 0).unwrap_or(0),
         depth,
         conf: s.head("conf", patch, pairs)?,
         gs: s.head("gs", patch, pairs)?,
@@ -134,7 +139,15 @@ impl Shapes<'_> {
             return Ok(Head { kind: HeadKind::XdecConv, ..Head::none() });
         }
         let dim = self.size(&format!("{dec}.projects.weight"), 0)?;
+        let blocks = self.blocks(&format!("{dec}.blocks."));
+        if self.has(&format!("{head}.conv.")) {
+            let half = patch / 2;
+            let hidden = self.size(&format!("{head}.proj.weight"), 0)? / half.saturating_mul(half).max(1);
+            let features = self.size(&format!("{head}.conv.0.weight"), 0)?;
+            let out = self.size(&format!("{head}.conv.3.weight"), 0)? / 4;
+            return Ok(Head::guided(out, (dim, blocks, dim / HEAD_WIDTH), hidden, features));
+        }
         let out = self.size(&format!("{head}.proj.weight"), 0)? / patch.saturating_mul(patch).max(1);
-        Ok(Head::xdec_linear(out, dim, self.blocks(&format!("{dec}.blocks.")), dim / HEAD_WIDTH))
+        Ok(Head::xdec_linear(out, dim, blocks, dim / HEAD_WIDTH))
     }
 }

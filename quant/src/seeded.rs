@@ -8,7 +8,8 @@
 //! |---|---|---|
 //! | depth, log z | 0.5 | ln 5: some units away |
 //! | depth, ray channels a and b | 0.005 | a ramp over the patch: a focal length of 14 patches |
-//! | confidence | 0.5 | 0 |
+//! | confidence of its own head | 0.5 | 0 |
+//! | confidence beside the depth | 0.5 | 2: no sky |
 //! | Gaussians (residuals on priors) | 0.1 | 0 |
 //! | motion: velocity, dynamic logit | 0.5 | 0 |
 //! | camera translation, rotation, field of view | 0.1 | rotation: identity |
@@ -25,6 +26,8 @@ pub const CONFIG_KEY: &str = "streetforward.config";
 
 /// ln 5 in f32: the usual depth of an untrained network.
 const LOG_DEPTH: f32 = 1.609_438;
+/// Logit of the confidence that stands beside the depth: everything is land, whose depth is then seen.
+const LAND: f32 = 2.0;
 /// Focal length in patches of an untrained network: 53 degrees for 14 patches across.
 const FOCAL_PATCHES: f32 = 14.0;
 
@@ -103,7 +106,7 @@ impl Seeded {
 
     /// Factor on the deviation of output `o` of a weight; 1 except in output layers.
     fn gain(&self, name: &str, o: usize) -> f64 {
-        let Some(head) = output_layer(name) else { return 1.0 };
+        let Some(head) = output_layer(&self.config, name) else { return 1.0 };
         match head {
             "camera" => 0.1,
             "gs" | "motion" if self.outputs == Outputs::Neutral => 0.0,
@@ -114,7 +117,7 @@ impl Seeded {
     }
 
     fn fill_bias(&self, name: &str, out: &mut [f32]) {
-        match (output_layer(name), name) {
+        match (output_layer(&self.config, name), name) {
             (Some("point"), _) => {
                 let side = self.config.patch as usize;
                 for (o, value) in out.iter_mut().enumerate() {
@@ -122,7 +125,8 @@ impl Seeded {
                     let (y, x) = (o % (side * side) / side, o % side);
                     let ramp = |p: usize| (p as f32 + 0.5 - side as f32 / 2.0) / (FOCAL_PATCHES * side as f32);
                     *value = match (self.config.depth_map, self.config.depth.kind, channel) {
-                        (DepthMap::ExpZ, ..) | (_, _, 2) => LOG_DEPTH,
+                        (DepthMap::ExpZConf, _, 1) => LAND,
+                        (DepthMap::ExpZ | DepthMap::ExpZConf, ..) | (_, _, 2) => LOG_DEPTH,
                         (_, HeadKind::XdecLinear, 0) => ramp(x),
                         (_, HeadKind::XdecLinear, _) => ramp(y),
                         _ => 0.0,
@@ -138,25 +142,37 @@ impl Seeded {
         }
     }
 
-    /// Channel (a, b, l) of output `o` of the depth head's last layer.
+    /// Channel (a, b, l; or l; or l, c) of output `o` of the depth head's last layer.
     fn point_channel(&self, o: usize) -> usize {
         match self.config.depth.kind {
             HeadKind::XdecLinear => o / (self.config.patch * self.config.patch) as usize,
+            HeadKind::Guided => o / 4,
             _ => o,
         }
     }
 }
 
 /// The head (`point`, `conf`, `gs`, `motion`, `camera`) whose output layer a weight or bias belongs to.
-pub(crate) fn output_layer(name: &str) -> Option<&str> {
+pub(crate) fn output_layer<'a>(config: &ModelConfig, name: &'a str) -> Option<&'a str> {
     let (layer, _) = name.rsplit_once('.')?;
-    for head in ["point", "conf", "gs", "motion"] {
-        let rest = layer.strip_prefix(head).and_then(|r| r.strip_prefix("_head."));
-        if matches!(rest, Some("proj" | "scratch.output_conv2.2")) {
-            return Some(head);
-        }
+    if let Some((head, layer)) = layer.split_once("_head.") {
+        let kind = match head {
+            "point" => config.depth.kind,
+            "conf" => config.conf.kind,
+            "gs" => config.gs.kind,
+            "motion" => config.motion.kind,
+            "camera" => return ["fc_t", "fc_rot", "fc_fov"].contains(&layer).then_some(head),
+            _ => return None,
+        };
+        let last = match kind {
+            HeadKind::XdecLinear => "proj",
+            HeadKind::Dpt => "scratch.output_conv2.2",
+            HeadKind::Guided => "conv.3",
+            HeadKind::None | HeadKind::XdecConv => return None,
+        };
+        return (layer == last).then_some(head);
     }
-    matches!(layer, "camera_head.fc_t" | "camera_head.fc_rot" | "camera_head.fc_fov").then_some("camera")
+    None
 }
 
 impl Checkpoint for Seeded {

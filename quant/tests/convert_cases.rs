@@ -278,7 +278,7 @@ fn c03_other_element_types() {
     let (path, values) = with_dtype(dir.path(), "F16", |v| if v < 0.0 { vec![0, 0xbc] } else { vec![0, 0x3c] });
     assert_eq!(converted(path), values.iter().map(|&v| if v < 0.0 { -1.0 } else { 1.0 }).collect::<Vec<f32>>());
     let (path, _) = with_dtype(dir.path(), "I8", |v| vec![v as i8 as u8]);
-    let wrong = plan_files(std::slice::from_ref(&path), &Options { config: Some(ModelConfig::nano()), ..f32s() });
+    let wrong = plan_files(std::slice::from_ref(&path), &Options { config: Some(ModelConfig::base()), ..f32s() });
     assert_eq!(wrong.unwrap_err().status() as i32, 2);
     let e = convert_files(&[path], &out, Overwrite::Yes, &f32s()).unwrap_err();
     assert!(e.status() as i32 == 7 && e.to_string().contains("encoder.blocks.0.attn.qkv.weight"), "{e}");

@@ -46,6 +46,28 @@ pub fn tiny() -> ModelConfig {
         causal_depth: 3,
         causal_heads: 2,
         motion: Head::dpt(4, [0, 1, 2, 2], [8, 8, 8, 8], 16),
+        ..ModelConfig::base()
+    }
+}
+
+/// [`tiny`] with guided heads and everything else that the nano preset has: confidence beside the depth, time in
+/// the tokens, the field of view from the camera head, one velocity for both passes.
+pub fn tiny_guided() -> ModelConfig {
+    let head = |out| Head::guided(out, (16, 1, 2), 6, 12);
+    let tiny = tiny();
+    ModelConfig {
+        encoder: tiny.encoder,
+        pos_grid: tiny.pos_grid,
+        aa: tiny.aa,
+        camera_dim: tiny.camera_dim,
+        camera_heads: tiny.camera_heads,
+        camera_width: tiny.camera_width,
+        guide_channels: 5,
+        depth: head(2),
+        gs: head(11),
+        motion: head(4),
+        time_dim: tiny.time_dim,
+        causal_heads: tiny.causal_heads,
         ..ModelConfig::nano()
     }
 }

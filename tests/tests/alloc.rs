@@ -2,7 +2,7 @@
 
 use sf_formats::blob::Dtype;
 use sf_formats::config::Head;
-use sf_tests::tiny::{Frames, model, session, tensors, tiny};
+use sf_tests::tiny::{Frames, model, session, tensors, tiny, tiny_guided};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
 
@@ -40,7 +40,7 @@ fn a_warm_session_allocates_nothing() {
         conf: Head::none(),
         ..tiny()
     };
-    for config in [pyramids, linear] {
+    for config in [pyramids, linear, tiny_guided()] {
         for dtype in [Dtype::F32, Dtype::F16] {
             let model = model(&config, &tensors(&config, 1), dtype);
             let clip = Frames::new(3, 28, 42, 1);

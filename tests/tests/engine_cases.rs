@@ -5,7 +5,7 @@ use sf_formats::blob::Dtype;
 use sf_formats::clip::{Clip, ClipOptions};
 use sf_formats::config::{Extrapolate, Head, ModelConfig};
 use sf_formats::{Intrinsics, Status};
-use sf_tests::tiny::{Frames, model, session, stages, tensors, tiny};
+use sf_tests::tiny::{Frames, model, session, stages, tensors, tiny, tiny_guided};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
@@ -266,8 +266,13 @@ fn a_failed_run_leaves_no_result() {
 /// Frames that arrive one by one: every window has the bits of a run from scratch.
 #[test]
 fn a_stream_has_the_bits_of_its_windows() {
-    let config = tiny();
-    let model = model(&config, &tensors(&config, 16), Dtype::F32);
+    for config in [tiny(), tiny_guided()] {
+        stream_and_windows(&config);
+    }
+}
+
+fn stream_and_windows(config: &ModelConfig) {
+    let model = model(config, &tensors(config, 16), Dtype::F32);
     let drive = Frames::new(6, 28, 42, 16);
     let shape = ClipShape { frames: 3, ..drive.shape };
     let (mut stream, mut scratch) = (session(&model, shape), session(&model, shape));

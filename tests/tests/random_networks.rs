@@ -4,8 +4,8 @@
 use sf_formats::ModelConfig;
 use sf_formats::blob::Dtype;
 use sf_formats::config::{
-    Anchor, AngleRound, Combine, Concat, DepthMap, Extrapolate, GsMap, Head, KSource, MotionFrame, MotionLayout,
-    MotionPer, Order, Orientation, PixelCentre, RcuSkip, Trunk,
+    Anchor, AngleRound, Combine, Concat, DepthMap, Extrapolate, GsMap, Head, HeadKind, KSource, MotionFrame,
+    MotionLayout, MotionPer, Order, Orientation, PixelCentre, RcuSkip, Trunk,
 };
 use sf_tests::tiny::{Frames, Noise, model, stages, tensors};
 use streetforward::reference;
@@ -36,6 +36,11 @@ impl Draw {
             let (dim, heads) = self.width();
             return Head::xdec_linear(out, dim, self.number(0..3), heads);
         }
+        if self.of(&[true, false]) {
+            let (dim, heads) = self.width();
+            let decoder = (dim, self.number(0..3), heads);
+            return Head::guided(out, decoder, self.number(1..9), self.of(&[4, 7, 16]));
+        }
         let mut four = |options: std::ops::Range<u32>| std::array::from_fn(|_| self.number(options.clone()));
         let (taps, channels) = (four(0..layers), four(1..5).map(|c| 4 * c));
         let features = self.of(&[8, 16, 24]);
@@ -55,7 +60,8 @@ impl Draw {
         };
         let depth = 2 * self.number(1..4);
         let (encoder, aa) = (trunk(self, 2), trunk(self, depth));
-        let exp_z = self.of(&[true, false, false]);
+        let depth_map =
+            self.of(&[DepthMap::Pi3Point, DepthMap::Pi3Point, DepthMap::Pi3Point, DepthMap::ExpZ, DepthMap::ExpZConf]);
         let (camera_dim, camera_heads) = self.width();
         let causal_in = self.of(&[Concat::Last, Concat::FrameGlobal]);
         let single = self.of(&[true, false, false]);
@@ -77,13 +83,13 @@ impl Draw {
             camera_heads,
             camera_depth: self.number(0..3),
             camera_width: self.of(&[8, 20]),
-            camera_k: if exp_z {
-                KSource::Fov
-            } else {
+            camera_k: if depth_map == DepthMap::Pi3Point {
                 self.of(&[KSource::FitShared, KSource::FitFrame, KSource::Fov])
+            } else {
+                KSource::Fov
             },
             camera_pixel: self.of(&[PixelCentre::Half, PixelCentre::Integer]),
-            depth_map: if exp_z { DepthMap::ExpZ } else { DepthMap::Pi3Point },
+            depth_map,
             gs_map: self.of(&[GsMap::Residual, GsMap::Dggt]),
             time_dim,
             causal_depth,
@@ -102,23 +108,41 @@ impl Draw {
             world_anchor: self.of(&[Anchor::First, Anchor::Raw]),
             world_scale: self.of(&[1.0, 2.5]),
             render_extrapolate: self.of(&[Extrapolate::Mirror, Extrapolate::Direct]),
-            ..ModelConfig::nano()
+            sky_conf: self.of(&[0.1, 0.5]),
+            ..ModelConfig::base()
         };
-        config.depth = self.head(if exp_z { 1 } else { 3 }, depth / 2);
-        config.conf = if self.of(&[true, false]) { self.head(1, depth / 2) } else { Head::none() };
+        let out = match depth_map {
+            DepthMap::Pi3Point => 3,
+            DepthMap::ExpZ => 1,
+            DepthMap::ExpZConf => 2,
+        };
+        config.depth = self.head(out, depth / 2);
+        let conf = depth_map != DepthMap::ExpZConf && self.of(&[true, false]);
+        config.conf = if conf { self.head(1, depth / 2) } else { Head::none() };
         config.gs = if self.of(&[true, true, false]) { self.head(11, depth / 2) } else { Head::none() };
         config.motion = self.head(if single { 7 } else { 4 }, causal_depth);
+        let ModelConfig { patch, depth, conf, gs, motion, .. } = &mut config;
+        let mut guided = false;
+        for head in [depth, conf, gs, motion] {
+            if head.kind == HeadKind::Guided {
+                // Guided heads need an even patch.
+                *patch = if *patch == 7 { 6 } else { *patch };
+                guided = true;
+            }
+        }
+        config.guide_channels = if guided { self.number(1..8) } else { 0 };
         config
     }
 }
 
 #[test]
 fn fast_and_reference_agree_on_random_networks() {
-    let mut worst = (0.0f32, String::new());
+    let (mut worst, mut guided) = ((0.0f32, String::new()), 0);
     for seed in 0..40 {
         let mut draw = Draw(Noise::new(1000 + seed));
         let config = draw.config();
         config.check("random").unwrap_or_else(|e| panic!("seed {seed}: {e}"));
+        guided += usize::from(config.guide_channels > 0);
         let (rows, cols) = (draw.number(1..5) as usize, draw.number(1..6) as usize);
         let patch = config.patch as usize;
         let clip = Frames::new(draw.number(1..5) as usize, rows * patch, cols * patch, seed);
@@ -148,5 +172,6 @@ fn fast_and_reference_agree_on_random_networks() {
         }
         assert!(compared >= 15, "seed {seed}: {compared} stages");
     }
-    println!("worst: {} {:.1e}", worst.1, worst.0);
+    println!("worst: {} {:.1e}; {guided} networks with guided heads", worst.1, worst.0);
+    assert!(guided >= 8, "{guided} networks with guided heads");
 }

@@ -115,11 +115,11 @@ pub fn safetensors(tensors: &[(&str, &[usize], &[f32])], metadata: &[(&str, &str
 
 /// A network small enough to run in milliseconds in any build: 28x42 pixels make six patches.
 pub fn tiny_config() -> ModelConfig {
-    let nano = ModelConfig::nano();
+    let base = ModelConfig::base();
     ModelConfig {
-        encoder: Trunk { dim: 16, depth: 1, heads: 2, registers: 1, ..nano.encoder },
+        encoder: Trunk { dim: 16, depth: 1, heads: 2, registers: 1, ..base.encoder },
         pos_grid: 4,
-        aa: Trunk { dim: 16, depth: 2, heads: 2, registers: 1, ..nano.aa },
+        aa: Trunk { dim: 16, depth: 2, heads: 2, registers: 1, ..base.aa },
         camera_dim: 16,
         camera_depth: 1,
         camera_heads: 2,
@@ -131,7 +131,7 @@ pub fn tiny_config() -> ModelConfig {
         causal_depth: 4,
         causal_heads: 3,
         motion: Head::dpt(4, [0, 1, 2, 3], [4, 4, 8, 8], 8),
-        ..nano
+        ..base
     }
 }
 

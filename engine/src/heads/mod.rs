@@ -2,8 +2,10 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | `decoder.rs` | Pi3's transformer decoder, shared by the camera and the linear heads |
+//! | `decoder.rs` | Pi3's transformer decoder, shared by the camera, the linear and the guided heads |
 //! | `linear.rs` | one linear layer and a pixel shuffle |
+//! | `guided.rs` | half-resolution convolutions beside the image |
+//! | `stem.rs` | the image as guided heads see it |
 //! | `dpt.rs` | VGGT's convolutional pyramid over four taps |
 //! | `camera.rs` | pose and field of view |
 //!
@@ -13,7 +15,9 @@
 pub(crate) mod camera;
 pub(crate) mod decoder;
 pub(crate) mod dpt;
+pub(crate) mod guided;
 pub(crate) mod linear;
+pub(crate) mod stem;
 
 use crate::block::Net;
 use crate::dims::Dims;
@@ -38,6 +42,8 @@ pub(crate) struct Dense<'a> {
     pub(crate) dims: &'a Dims,
     pub(crate) tables: &'a Tables,
     pub(crate) dpt: Option<&'a DptTables>,
+    /// The image stem of all frames; empty where no head is guided.
+    pub(crate) guide: &'a [f32],
     pub(crate) head: &'a DenseHead,
     /// Which tokens a decoder runs on.
     pub(crate) tokens: Tokens,
@@ -56,6 +62,9 @@ impl Dense<'_> {
             (DenseHead::Linear(head), Source::Tokens(x)) => {
                 linear::prepare(self.net, head, (self.dims, self.tables), self.job(x), scratch, probe)
             }
+            (DenseHead::Guided(head), Source::Tokens(x)) => {
+                guided::prepare(self.net, head, (self.dims, self.tables), self.job(x), scratch, probe)
+            }
             (DenseHead::Dpt(_), Source::Taps(_)) => Ok(()),
             _ => unreachable!("the source is chosen by the kind of the head"),
         }
@@ -66,6 +75,11 @@ impl Dense<'_> {
         match (self.head, source) {
             (DenseHead::Linear(head), Source::Tokens(x)) => {
                 linear::frame(self.net, head, self.dims, self.job(x).per_frame(self.dims), (frame, scratch, out));
+            }
+            (DenseHead::Guided(head), Source::Tokens(x)) => {
+                let per_frame = self.job(x).per_frame(self.dims);
+                let job = guided::Paint { frame, per_frame, guide: self.guide, scratch, out };
+                guided::frame(self.net, head, self.dims, job);
             }
             (DenseHead::Dpt(head), Source::Taps(taps)) => {
                 let tables = self.dpt.expect("a pyramid has its position tables");
@@ -80,6 +94,7 @@ impl Dense<'_> {
 pub(crate) fn channels(head: &DenseHead) -> usize {
     match head {
         DenseHead::Linear(h) => h.out,
+        DenseHead::Guided(h) => h.out,
         DenseHead::Dpt(h) => h.out,
     }
 }
@@ -88,6 +103,7 @@ pub(crate) fn channels(head: &DenseHead) -> usize {
 pub(crate) fn scratch_len(head: &DenseHead, dims: &Dims, tokens: usize, threads: usize) -> usize {
     match head {
         DenseHead::Linear(h) => linear::scratch_len(h, dims, tokens, threads),
+        DenseHead::Guided(h) => guided::scratch_len(h, dims, tokens, threads),
         DenseHead::Dpt(h) => dpt::scratch_len(h, dims),
     }
 }

@@ -3,6 +3,7 @@
 
 use super::{Network, Weights};
 use crate::embed::PositionEmbedding;
+use crate::preprocess::Normaliser;
 use crate::tables;
 use sf_formats::config::{Head, RcuSkip, Trunk};
 use sf_ops::attention::FrameMask;
@@ -125,6 +126,52 @@ pub(super) fn linear_head(net: &Network, name: &str, x: &[f32], head: &Head, reg
     out
 }
 
+/// relu(conv 3x3 stride 2) of every normalised image: `[frames, height/2, width/2, guide.channels]`.
+pub(super) fn image_stem(net: &Network) -> Vec<f32> {
+    let d = &net.d;
+    let normaliser = Normaliser::new(net.config);
+    let mut out = Vec::new();
+    for f in 0..d.frames {
+        let mut image = vec![0.0; d.pixels() * 3];
+        normaliser.apply(net.input.frame(f), &mut image);
+        let image = Map { data: image, h: d.height, w: d.width };
+        out.extend(image.conv(net.w, "image_stem", 3, 2).map(naive::relu).data);
+    }
+    out
+}
+
+/// Decoder, linear layer to half resolution, convolutions beside the image stem, pixel shuffle:
+/// `[frames, height, width, out]`.
+pub(super) fn guided_head(
+    net: &Network,
+    name: &str,
+    (x, guide): (&[f32], &[f32]),
+    head: &Head,
+    registers: usize,
+) -> Vec<f32> {
+    let d = &net.d;
+    let (h, w, dim) = (d.height / 2, d.width / 2, head.dim as usize);
+    let trunk = decoder_trunk(head.dim, head.depth, head.heads, head.eps);
+    let decoded = decoder(net, &format!("{name}_decoder"), x, &trunk, registers);
+    let proj = net.w.get(&format!("{name}_head.proj.weight"));
+    let bias = net.w.get(&format!("{name}_head.proj.bias"));
+    let conv = |i: usize, x: &Map| x.conv(net.w, &format!("{name}_head.conv.{i}"), 3, 1);
+    let mut out = Vec::new();
+    for (tokens, guide) in decoded.chunks_exact(d.patches * dim).zip(guide.chunks_exact(guide.len() / d.frames)) {
+        let spread = naive::linear(Mat::new(tokens, d.patches, dim), proj, Some(bias));
+        let spread = Mat::new(&spread, d.patches, bias.len());
+        let features = naive::pixel_shuffle(spread, (d.rows, d.cols), net.config.patch as usize / 2);
+        let pixels = features.chunks_exact(head.hidden as usize).zip(guide.chunks_exact(guide.len() / (h * w)));
+        let joined = Map { data: pixels.flat_map(|(f, g)| [f, g].concat()).collect(), h, w };
+        let x = conv(0, &joined).map(naive::relu);
+        let y = conv(1, &x).map(naive::relu);
+        let y = conv(2, &y).plus(&x).map(naive::relu);
+        let o = conv(3, &y);
+        out.extend(naive::pixel_shuffle(Mat::new(&o.data, h * w, 4 * head.out as usize), (h, w), 2));
+    }
+    out
+}
+
 /// A map with its size, channels last.
 struct Map {
     data: Vec<f32>,
@@ -135,6 +182,15 @@ struct Map {
 impl Map {
     fn view(&self) -> Hwc<'_> {
         Hwc::new(&self.data, self.h, self.w, self.data.len() / (self.h * self.w))
+    }
+
+    /// Convolution with a named layer, padding kernel / 2.
+    fn conv(&self, w: &Weights, name: &str, kernel: usize, stride: usize) -> Map {
+        let weight = w.get(&format!("{name}.weight"));
+        let bias = w.optional(&format!("{name}.bias"));
+        let window = naive::Window { kernel, stride, pad: kernel / 2 };
+        let out = |n| sf_ops::conv::conv_out(n, kernel, stride, kernel / 2);
+        Map { data: naive::conv2d(self.view(), weight, bias, window), h: out(self.h), w: out(self.w) }
     }
 
     fn map(&self, f: impl Fn(f32) -> f32) -> Map {
@@ -167,11 +223,7 @@ struct Dpt<'a> {
 
 impl Dpt<'_> {
     fn conv(&self, name: &str, x: &Map, kernel: usize, stride: usize) -> Map {
-        let w = self.w.get(&format!("{}.{name}.weight", self.p));
-        let b = self.w.optional(&format!("{}.{name}.bias", self.p));
-        let window = naive::Window { kernel, stride, pad: kernel / 2 };
-        let out = |n| sf_ops::conv::conv_out(n, kernel, stride, kernel / 2);
-        Map { data: naive::conv2d(x.view(), w, b, window), h: out(x.h), w: out(x.w) }
+        x.conv(self.w, &format!("{}.{name}", self.p), kernel, stride)
     }
 
     fn up(&self, name: &str, x: &Map, kernel: usize) -> Map {

@@ -274,6 +274,10 @@ impl Network<'_> {
                 let x = self.last(s, self.config.head_concat);
                 layers::linear_head(self, name, &x, head, registers)
             }
+            HeadKind::Guided => {
+                let x = self.last(s, self.config.head_concat);
+                layers::guided_head(self, name, (&x, &s.get("guide").data), head, registers)
+            }
             HeadKind::Dpt => {
                 let taps: Vec<Vec<f32>> = head
                     .taps
@@ -299,6 +303,10 @@ impl Network<'_> {
 
     fn depth(&self, s: &mut Stages) {
         let (c, d) = (self.config, &self.d);
+        if c.guide_channels > 0 {
+            let size = [d.frames, d.height / 2, d.width / 2, c.guide_channels as usize];
+            s.put("guide", &size, layers::image_stem(self));
+        }
         let raw = self.head(s, "point", &c.depth);
         let (points, channels) = match c.depth_map {
             DepthMap::Pi3Point => {
@@ -309,6 +317,11 @@ impl Network<'_> {
                 (points.collect(), 3)
             }
             DepthMap::ExpZ => (raw.iter().map(|&l| naive::exp(l)).collect::<Vec<f32>>(), 1),
+            DepthMap::ExpZConf => {
+                let conf = raw.chunks_exact(2).map(|p| p[1]).collect();
+                s.put("conf", &[d.frames, d.height, d.width], conf);
+                (raw.chunks_exact(2).map(|p| naive::exp(p[0])).collect(), 1)
+            }
         };
         s.put("point", &[d.frames, d.height, d.width, channels], points);
         if c.conf.exists() {
@@ -382,6 +395,10 @@ impl Network<'_> {
             HeadKind::Dpt => {
                 let taps: Vec<Vec<f32>> = c.motion.taps.iter().map(|&t| taps[t as usize].clone()).collect();
                 layers::dpt(self, "motion", &taps, &c.motion)
+            }
+            HeadKind::Guided => {
+                let x = self.patches(&x, registers);
+                layers::guided_head(self, "motion", (&x, &s.get("guide").data), &c.motion, 0)
             }
             _ => layers::linear_head(self, "motion", &self.patches(&x, registers), &c.motion, 0),
         }
