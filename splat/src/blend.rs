@@ -26,11 +26,11 @@ use crate::project::{BLOCK, Record, TILE, X_CUT};
 pub const T_STOP: f32 = 1e-4;
 const SIDE: usize = TILE as usize;
 /// Blocks in a row of a tile.
-const PER_ROW: usize = SIDE / BLOCK;
+pub(crate) const PER_ROW: usize = SIDE / BLOCK;
 /// Blocks of a tile: the bits of a mask.
-const BLOCKS: usize = PER_ROW * PER_ROW;
+pub(crate) const BLOCKS: usize = PER_ROW * PER_ROW;
 /// Entries dealt out together: 12 KiB of them and at most 16 KiB of lists stay in the first-level cache.
-const CHUNK: usize = 256;
+pub(crate) const CHUNK: usize = 256;
 /// Entries between the second hint for a record and its use.
 const AHEAD: usize = 16;
 /// Most depth buckets of a list.
@@ -53,7 +53,7 @@ struct Block {
 
 /// A Gaussian in the coordinates of a tile: X and Y count pixel centres from the tile's first.
 #[derive(Clone, Copy, Debug, Default)]
-struct Shown {
+pub(crate) struct Shown {
     /// d of the tile's first pixel.
     d: f32,
     /// Change of d per column.
@@ -67,7 +67,7 @@ struct Shown {
     /// -log2(opacity).
     nlo: f32,
     /// Red, green, blue, z.
-    value: [f32; 4],
+    pub(crate) value: [f32; 4],
     index: u32,
 }
 
@@ -98,7 +98,7 @@ pub struct Channels<'a> {
 pub struct Tile {
     blocks: Box<[Block; BLOCKS]>,
     /// Bit b set while block b has an unfinished pixel.
-    alive: u64,
+    pub(crate) alive: u64,
     /// `[block, channel][lane]`.
     extra: Vec<[f32; LANES]>,
     /// The list as it came, then the list by depth bucket.
@@ -175,6 +175,39 @@ impl Body for Blend<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let Blend { tile, place, shared } = self;
+        tile.each_chunk(s, place, shared, &mut Composite);
+    }
+}
+
+/// What is done with a chunk that has been dealt out to the lists of the blocks.
+pub(crate) trait Draw {
+    /// Draws the chunk, the keys `keys` of the ordered list, and updates the mask of unfinished blocks.
+    fn draw<S: Simd>(&mut self, s: S, tile: &mut Tile, shared: &Shared, keys: Range<usize>);
+}
+
+/// Draws chunks into the tile's pixels.
+struct Composite;
+
+impl Draw for Composite {
+    #[inline(always)]
+    fn draw<S: Simd>(&mut self, s: S, tile: &mut Tile, shared: &Shared, _: Range<usize>) {
+        tile.draw(s, shared);
+    }
+}
+
+/// Keys of one bucket: some ten, rarely many.
+#[inline(always)]
+fn sort(keys: &mut [u64]) {
+    if keys.len() > 1 {
+        keys.sort_unstable();
+    }
+}
+
+impl Tile {
+    /// Orders the list front to back as far as it is seen, and hands it on in chunks.
+    #[inline(always)]
+    pub(crate) fn each_chunk<S: Simd, D: Draw>(&mut self, s: S, place: Place, shared: &Shared, draw: &mut D) {
+        let tile = self;
         let (form, first) = (shared.form, (place.x, place.y));
         let buckets = tile.split(form);
         // Kept keys move to the front of the list, in order; `dealt..kept` wait for their records.
@@ -195,26 +228,20 @@ impl Body for Blend<'_> {
                 prefetch(shared.record(key));
             }
             while kept - dealt >= CHUNK {
-                tile.deal_and_draw(s, place, shared, dealt..dealt + CHUNK);
+                tile.deal_keys(place, shared, dealt..dealt + CHUNK);
+                draw.draw(s, tile, shared, dealt..dealt + CHUNK);
+                tile.empty_chunk();
                 dealt += CHUNK;
                 if tile.alive == 0 {
                     return;
                 }
             }
         }
-        tile.deal_and_draw(s, place, shared, dealt..kept);
+        tile.deal_keys(place, shared, dealt..kept);
+        draw.draw(s, tile, shared, dealt..kept);
+        tile.empty_chunk();
     }
-}
 
-/// Keys of one bucket: some ten, rarely many.
-#[inline(always)]
-fn sort(keys: &mut [u64]) {
-    if keys.len() > 1 {
-        keys.sort_unstable();
-    }
-}
-
-impl Tile {
     /// Starts a tile: T = 1 inside the image, finished outside, and an empty list.
     pub fn clear(&mut self, place: Place, channels: usize) {
         self.alive = 0;
@@ -230,8 +257,7 @@ impl Tile {
         self.extra.clear();
         self.extra.resize(BLOCKS * channels, [0.0; LANES]);
         self.keys[0].clear();
-        self.chunk.len = 0;
-        self.chunk.lens = [0; BLOCKS];
+        self.empty_chunk();
         self.updates = 0;
     }
 
@@ -292,9 +318,9 @@ impl Tile {
         buckets
     }
 
-    /// Draws at most [`CHUNK`] keys of the list.
+    /// Deals at most [`CHUNK`] keys of the ordered list.
     #[inline(always)]
-    fn deal_and_draw<S: Simd>(&mut self, s: S, place: Place, shared: &Shared, keys: Range<usize>) {
+    fn deal_keys(&mut self, place: Place, shared: &Shared, keys: Range<usize>) {
         for i in keys.clone() {
             // Again, for those that the first hint lost.
             prefetch(shared.record(self.keys[1][(i + AHEAD).min(keys.end - 1)]));
@@ -302,7 +328,11 @@ impl Tile {
             let record = shared.record(key);
             self.deal(record, place, shared.form.blocks(key, || record.blocks((place.x, place.y))));
         }
-        self.draw(s, shared);
+    }
+
+    fn empty_chunk(&mut self) {
+        self.chunk.len = 0;
+        self.chunk.lens = [0; BLOCKS];
     }
 
     /// Appends a Gaussian to the chunk and to the lists of the unfinished ones of `blocks`.
@@ -331,10 +361,20 @@ impl Tile {
         }
     }
 
-    /// Draws the chunk and empties it.
+    /// The Gaussians of the chunk and the keys of a part of the ordered list.
+    pub(crate) fn chunk_and_keys(&self, keys: Range<usize>) -> (&[Shown], &[u64]) {
+        (&self.chunk.shown[..self.chunk.len], &self.keys[1][keys])
+    }
+
+    /// T of a block, negated where finished; the Gaussians of the chunk; which of them the block takes.
+    pub(crate) fn block(&mut self, b: usize) -> (&mut [f32; LANES], &[Shown; CHUNK], &[u8]) {
+        let chunk = &self.chunk;
+        (&mut self.blocks[b].t, &chunk.shown, &chunk.lists[b][..usize::from(chunk.lens[b]).min(CHUNK)])
+    }
+
+    /// Draws the chunk.
     #[inline(always)]
     fn draw<S: Simd>(&mut self, s: S, shared: &Shared) {
-        let (lane_x, lane_y) = (s.load(&LANE_X), s.load(&LANE_Y));
         let mut left = self.alive;
         while left != 0 {
             let b = left.trailing_zeros() as usize % BLOCKS;
@@ -343,15 +383,12 @@ impl Tile {
             if list.is_empty() {
                 continue;
             }
-            let x = lane_x + s.splat((b % PER_ROW * BLOCK) as f32);
-            let y = lane_y + s.splat((b / PER_ROW * BLOCK) as f32);
             let extra = &mut self.extra[b * shared.extra.channels..][..shared.extra.channels];
-            let (taken, alive) = take(s, &mut self.blocks[b], (x, y), list, &self.chunk.shown, shared, extra);
+            let (taken, alive) =
+                take(s, &mut self.blocks[b], columns_rows(s, b), list, &self.chunk.shown, shared, extra);
             self.updates += taken as u64;
             self.alive &= !(u64::from(!alive) << b);
         }
-        self.chunk.len = 0;
-        self.chunk.lens = [0; BLOCKS];
     }
 
     /// Four neighbouring pixels of row `y`, from column `4 column`: T, and the sums of red, green, blue and z.
@@ -371,34 +408,72 @@ impl Tile {
     }
 }
 
+/// Columns and rows of the pixels of block `b`, counted from the tile's first.
+#[inline(always)]
+pub(crate) fn columns_rows<S: Simd>(s: S, b: usize) -> (S::V, S::V) {
+    let x = s.load(&LANE_X) + s.splat((b % PER_ROW * BLOCK) as f32);
+    let y = s.load(&LANE_Y) + s.splat((b / PER_ROW * BLOCK) as f32);
+    (x, y)
+}
+
+/// A Gaussian at sixteen pixels.
+pub(crate) struct Step<V> {
+    /// Alpha, also where it is not composited.
+    pub(crate) alpha: V,
+    /// T alpha, 0 where it is not composited.
+    pub(crate) weight: V,
+    /// What T becomes.
+    pub(crate) t: V,
+    /// The pixels that are unfinished after it.
+    pub(crate) going: u16,
+}
+
+impl Shown {
+    /// d and e of sixteen pixels.
+    #[inline(always)]
+    pub(crate) fn form<S: Simd>(&self, s: S, (x, y): (S::V, S::V)) -> (S::V, S::V) {
+        let d = s.splat(self.cx).mul_add(x, s.splat(self.dy).mul_add(y, s.splat(self.d)));
+        (d, s.splat(self.ar).mul_add(y, s.splat(self.e)))
+    }
+
+    /// Composites over a T that is negative where a pixel is finished.
+    #[inline(always)]
+    pub(crate) fn step<S: Simd>(&self, s: S, at: (S::V, S::V), t: S::V, a_max: f32) -> Step<S::V> {
+        let (zero, cut, stop, a_max) = (s.splat(0.0), s.splat(X_CUT.next_up()), s.splat(T_STOP), s.splat(a_max));
+        let (d, e) = self.form(s, at);
+        let q = d.mul_add(d, e.mul_add(e, s.splat(self.nlo)));
+        let raw = exp2_neg(s, q);
+        let alpha = cut.select_gt(q, a_max.select_gt(raw, raw, a_max), zero);
+        let weight = alpha * t;
+        let next = t - weight;
+        Step {
+            alpha,
+            weight: next.select_gt(stop, weight, zero),
+            t: next.select_gt(stop, next, t.abs().negate(u16::MAX)),
+            going: next.gt_bits(stop),
+        }
+    }
+}
+
 /// One block takes its list; how many entries it took and whether a pixel is still unfinished.
 #[inline(always)]
 fn take<S: Simd>(
     s: S,
     block: &mut Block,
-    (x, y): (S::V, S::V),
+    at: (S::V, S::V),
     list: &[u8],
     shown: &[Shown; CHUNK],
     shared: &Shared,
     extra: &mut [[f32; LANES]],
 ) -> (usize, bool) {
-    let (zero, cut, stop, a_max) = (s.splat(0.0), s.splat(X_CUT.next_up()), s.splat(T_STOP), s.splat(shared.a_max));
     let mut t = s.load(&block.t);
     let (mut r, mut g) = (s.load(&block.sum[0]), s.load(&block.sum[1]));
     let (mut b, mut z) = (s.load(&block.sum[2]), s.load(&block.sum[3]));
     let (mut taken, mut alive) = (list.len(), true);
     for (n, &i) in list.iter().enumerate() {
         let o = &shown[usize::from(i)];
-        let d = s.splat(o.cx).mul_add(x, s.splat(o.dy).mul_add(y, s.splat(o.d)));
-        let e = s.splat(o.ar).mul_add(y, s.splat(o.e));
-        let q = d.mul_add(d, e.mul_add(e, s.splat(o.nlo)));
-        let raw = exp2_neg(s, q);
-        let alpha = cut.select_gt(q, a_max.select_gt(raw, raw, a_max), zero);
-        let weight = alpha * t;
-        let next = t - weight;
-        let weight = next.select_gt(stop, weight, zero);
-        let going = next.gt_bits(stop);
-        t = next.select_gt(stop, next, t.abs().negate(u16::MAX));
+        let Step { weight, t: next, going, .. } = o.step(s, at, t, shared.a_max);
+        t = next;
         r = weight.mul_add(s.splat(o.value[0]), r);
         g = weight.mul_add(s.splat(o.value[1]), g);
         b = weight.mul_add(s.splat(o.value[2]), b);

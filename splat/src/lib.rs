@@ -7,7 +7,11 @@
 //! | `bin.rs` | records -> one list of `depth, record, blocks` keys per 32x32 tile |
 //! | `blend.rs` | one tile front to back: lazy depth buckets, lists per 4x4 block, state in registers |
 //! | `render.rs` | [`Renderer`]: memory, threads, output images |
+//! | `blend_back.rs` | one tile back to front: gradients of its pixels -> sums per Gaussian |
+//! | `project_back.rs` | sums of a Gaussian -> gradients of its fields and of the camera |
+//! | `backward.rs` | [`Renderer::backward`]: both over a whole image |
 //! | `reference.rs` | the same picture by brute force in f64: the oracle of the tests |
+//! | `reference_grad.rs` | its gradients by the chain rule in f64 |
 //!
 //! The maths. A Gaussian with mean m, scale s, rotation Q seen by a camera (R, c), p = R^T (m - c):
 //!
@@ -24,12 +28,18 @@
 //! where the code says so, one owner per tile, sort keys without equals.
 #![deny(unsafe_code)]
 
+pub mod backward;
 pub mod bin;
 pub mod blend;
+mod blend_back;
 pub mod math;
 pub mod project;
+mod project_back;
 pub mod reference;
+pub mod reference_grad;
 pub mod render;
 
+pub use backward::Gradients;
+pub use blend_back::ImageGradients;
 pub use render::{Extra, RenderOptions, Rendered, Renderer, Stats, render};
 pub use sf_formats::scene::SplatSettings;

@@ -193,14 +193,14 @@ pub fn check_settings(s: &SplatSettings) -> Result<()> {
 /// A camera with its settings, ready to project.
 #[derive(Clone, Copy, Debug)]
 pub struct Projector {
-    world_to_camera: DMat3,
-    centre: DVec3,
-    camera: Camera,
-    settings: SplatSettings,
+    pub(crate) world_to_camera: DMat3,
+    pub(crate) centre: DVec3,
+    pub(crate) camera: Camera,
+    pub(crate) settings: SplatSettings,
     /// Limits of x/z in the Jacobian.
-    clamp_x: (f64, f64),
+    pub(crate) clamp_x: (f64, f64),
     /// Limits of y/z in the Jacobian.
-    clamp_y: (f64, f64),
+    pub(crate) clamp_y: (f64, f64),
 }
 
 impl Projector {

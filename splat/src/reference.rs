@@ -27,52 +27,141 @@ pub struct ReferenceImage {
     pub alpha: Vec<f64>,
     /// Weight that may move because a decision is within rounding of its threshold `[height, width]`.
     pub slack: Vec<f64>,
+    /// Digest of all decisions: which Gaussian was composited, clamped to `a_max` or stopped which pixel, in which order.
+    /// Where two pictures have the same, the numbers between them are smooth.
+    pub decisions: u64,
+}
+
+/// One Gaussian, fields as in [`Gaussians`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Source {
+    /// Centre.
+    pub mean: DVec3,
+    /// Standard deviations.
+    pub scale: DVec3,
+    /// w, x, y, z.
+    pub quat: [f64; 4],
+    /// Opacity.
+    pub opacity: f64,
+    /// Colour.
+    pub rgb: [f64; 3],
+}
+
+impl Source {
+    /// Gaussian `i` of a scene.
+    pub fn of(scene: &Gaussians, i: usize) -> Source {
+        Source {
+            mean: DVec3::from_array(scene.mean[i].map(f64::from)),
+            scale: DVec3::from_array(scene.scale[i].map(f64::from)),
+            quat: scene.quat[i].map(f64::from),
+            opacity: f64::from(scene.opacity[i]),
+            rgb: scene.colour[i].map(f64::from),
+        }
+    }
+}
+
+/// How the picture is taken. The twelve numbers of the world-to-camera matrix are free here: p = r mean + t.
+#[derive(Clone, Copy, Debug)]
+pub struct View {
+    /// World to camera.
+    pub r: DMat3,
+    /// World to camera.
+    pub t: DVec3,
+    /// Size and intrinsics; its pose is not used.
+    pub camera: Camera,
+    /// Conventions.
+    pub settings: SplatSettings,
+    /// Colour behind everything.
+    pub background: [f32; 3],
+}
+
+impl View {
+    /// A valid camera's.
+    pub fn of(camera: &Camera, settings: &SplatSettings, background: [f32; 3]) -> View {
+        let inverse = camera.pose.inverse();
+        View { r: inverse.r, t: inverse.t, camera: *camera, settings: *settings, background }
+    }
 }
 
 /// A Gaussian on the screen.
-struct Splat {
-    z: f64,
+pub(crate) struct Splat {
+    pub(crate) index: usize,
+    pub(crate) z: f64,
     key: f32,
-    mean: DVec2,
-    inverse: DMat2,
-    opacity: f64,
-    rgb: [f64; 3],
+    pub(crate) mean: DVec2,
+    pub(crate) inverse: DMat2,
+    /// After antialiasing.
+    pub(crate) opacity: f64,
+    pub(crate) rgb: [f64; 3],
+    pub(crate) projection: Projection,
+}
+
+/// What the projection went through.
+pub(crate) struct Projection {
+    /// Mean in camera axes.
+    pub(crate) p: DVec3,
+    /// Rotation of the principal axes.
+    pub(crate) q: DMat3,
+    /// Clamped.
+    pub(crate) scale: DVec3,
+    /// Covariance in the world.
+    pub(crate) sigma: DMat3,
+    /// Rows of d(u, v)/dp.
+    pub(crate) jacobian: [DVec3; 2],
+    /// On the screen, low-pass included.
+    pub(crate) covariance: DMat2,
+    /// Its determinant without the low-pass.
+    pub(crate) before: f64,
 }
 
 /// Draws the scene. The camera must be valid.
 pub fn render(scene: &Gaussians, camera: &Camera, settings: &SplatSettings, background: [f32; 3]) -> ReferenceImage {
-    let mut splats: Vec<Splat> = (0..scene.len()).filter_map(|i| project(scene, i, camera, settings)).collect();
-    // The sort is stable, so equal depths stay in index order.
-    splats.sort_by(|a, b| a.key.total_cmp(&b.key));
+    let sources: Vec<Source> = (0..scene.len()).map(|i| Source::of(scene, i)).collect();
+    render_sources(&sources, &View::of(camera, settings, background))
+}
+
+/// Draws Gaussians of f64, as a difference quotient needs.
+pub fn render_sources(sources: &[Source], view: &View) -> ReferenceImage {
+    let splats = project_all(sources, view);
     let mut image = ReferenceImage::default();
-    for y in 0..camera.height {
-        for x in 0..camera.width {
+    for y in 0..view.camera.height {
+        for x in 0..view.camera.width {
             let centre = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            pixel(&splats, centre, f64::from(settings.a_max), background, &mut image);
+            pixel(&splats, centre, f64::from(view.settings.a_max), view.background, &mut image);
         }
     }
     image
 }
 
-fn project(scene: &Gaussians, i: usize, camera: &Camera, settings: &SplatSettings) -> Option<Splat> {
-    let (mean, scale, quat) = (scene.mean[i], scene.scale[i], scene.quat[i]);
-    let (opacity, rgb) = (scene.opacity[i], scene.colour[i]);
-    let all: Vec<f32> = mean.into_iter().chain(scale).chain(quat).chain(rgb).chain([opacity]).collect();
-    if all.iter().any(|v| !v.is_finite()) || scale.iter().any(|&s| s < 0.0) || quat == [0.0; 4] {
+/// Those in view, front to back.
+pub(crate) fn project_all(sources: &[Source], view: &View) -> Vec<Splat> {
+    let mut splats: Vec<Splat> = sources.iter().enumerate().filter_map(|(i, s)| project(i, s, view)).collect();
+    // The sort is stable, so equal depths stay in index order.
+    splats.sort_by(|a, b| a.key.total_cmp(&b.key));
+    splats
+}
+
+fn project(index: usize, source: &Source, view: &View) -> Option<Splat> {
+    let Source { mean, scale, quat, opacity, rgb } = *source;
+    let View { camera, settings, .. } = view;
+    let all = [mean.to_array(), scale.to_array(), rgb].concat();
+    if all.iter().chain(&quat).chain([&opacity]).any(|v| !v.is_finite())
+        || scale.min_element() < 0.0
+        || quat == [0.0; 4]
+    {
         return None;
     }
-    let p = camera.pose.inverse().apply(DVec3::from_array(mean.map(f64::from)));
+    let p = view.r * mean + view.t;
     let z = p.z;
     let key = z as f32;
     if !(key >= settings.near && key <= FAR) {
         return None;
     }
-    let scale = DVec3::from_array(scale.map(|s| f64::from(s.clamp(SCALE_RANGE.0, SCALE_RANGE.1))));
-    let [w, x, y, qz] = quat.map(f64::from);
+    let scale = scale.clamp(DVec3::splat(SCALE_RANGE.0.into()), DVec3::splat(SCALE_RANGE.1.into()));
+    let [w, x, y, qz] = quat;
     let q = DMat3::from_quat(DQuat::from_xyzw(x, y, qz, w).normalize());
     let sigma = q * DMat3::from_diagonal(scale * scale) * q.transpose();
-    let r = camera.pose.r.transpose();
-    let in_camera = r * sigma * r.transpose();
+    let in_camera = view.r * sigma * view.r.transpose();
 
     let k = camera.k;
     let (width, height) = (f64::from(camera.width), f64::from(camera.height));
@@ -88,17 +177,27 @@ fn project(scene: &Gaussians, i: usize, camera: &Camera, settings: &SplatSetting
     if s2.determinant().is_nan() || s2.determinant() <= 0.0 {
         return None;
     }
-    let mut opacity = f64::from(opacity.clamp(0.0, 1.0));
+    let mut opacity = opacity.clamp(0.0, 1.0);
     if settings.aa {
         opacity *= ((sxx * syy - sxy * sxy) / s2.determinant()).max(AA_FLOOR * AA_FLOOR).sqrt();
     }
     Some(Splat {
-        z: f64::from(key),
+        index,
+        z,
         key,
         mean: DVec2::new(k.fx * p.x / z + k.cx, k.fy * p.y / z + k.cy),
         inverse: s2.inverse(),
         opacity,
-        rgb: rgb.map(f64::from),
+        rgb,
+        projection: Projection {
+            p,
+            q,
+            scale,
+            sigma,
+            jacobian: [jx, jy],
+            covariance: s2,
+            before: sxx * syy - sxy * sxy,
+        },
     })
 }
 
@@ -108,6 +207,10 @@ fn pixel(splats: &[Splat], centre: DVec2, a_max: f64, background: [f32; 3], imag
     // Depth and alpha of the last Gaussian that took part. Equal depths are no matter of rounding:
     // both sides order them by index.
     let mut last = (f64::NEG_INFINITY, 0.0);
+    let mut decide = |s: &Splat, what: u64| {
+        image.decisions =
+            (image.decisions ^ (s.index as u64 * 4 + what)).wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(29);
+    };
     for s in splats {
         let d = centre - s.mean;
         let raw = s.opacity * (-0.5 * d.dot(s.inverse * d)).exp();
@@ -118,17 +221,20 @@ fn pixel(splats: &[Splat], centre: DVec2, a_max: f64, background: [f32; 3], imag
             continue;
         }
         let alpha = raw.min(a_max);
-        if s.z > last.0 && s.z - last.0 <= DEPTH_SLACK * s.z {
+        let key = f64::from(s.key);
+        if key > last.0 && key - last.0 <= DEPTH_SLACK * key {
             slack += t * alpha * last.1;
         }
-        last = (s.z, alpha);
+        last = (key, alpha);
         let next = t * (1.0 - alpha);
         if (next / 1e-4 - 1.0).abs() < T_SLACK {
             slack += t;
         }
         if next <= 1e-4 {
+            decide(s, 3);
             break;
         }
+        decide(s, 1 + u64::from(raw >= a_max));
         for c in 0..3 {
             rgb[c] += t * alpha * s.rgb[c];
         }

@@ -11,6 +11,7 @@ use sf_formats::{Camera, Error, Result};
 use sf_ops::Kernels;
 use sf_ops::par::Pool;
 
+use crate::backward::{Back, Drawn};
 use crate::bin::{self, GROUPS, Group, KeyForm};
 use crate::blend::{Blend, Channels, Place, Shared, Tile};
 use crate::project::{self, BLOCK, Counts, Projector, TILE};
@@ -136,10 +137,13 @@ pub fn render(
 /// Draws images, keeping memory between them.
 #[derive(Debug)]
 pub struct Renderer {
-    pool: Arc<Pool>,
-    kernels: &'static Kernels,
-    groups: [RwLock<Group>; GROUPS],
-    tiles: Vec<Mutex<Tile>>,
+    pub(crate) pool: Arc<Pool>,
+    pub(crate) kernels: &'static Kernels,
+    pub(crate) groups: [RwLock<Group>; GROUPS],
+    pub(crate) tiles: Vec<Mutex<Tile>>,
+    /// The last image, if it was drawn to the end.
+    pub(crate) drawn: Option<Drawn>,
+    pub(crate) back: Back,
 }
 
 impl Renderer {
@@ -171,6 +175,8 @@ impl Renderer {
             groups: std::array::from_fn(|_| RwLock::default()),
             tiles: (0..pool.threads()).map(|_| Mutex::default()).collect(),
             pool,
+            drawn: None,
+            back: Back::default(),
         }
     }
 
@@ -200,6 +206,7 @@ impl Renderer {
         options: &RenderOptions,
         out: &mut Rendered,
     ) -> Result<()> {
+        self.drawn = None;
         camera.check("camera")?;
         project::check_settings(settings)?;
         check_scene(scene)?;
@@ -230,6 +237,9 @@ impl Renderer {
         let records = std::array::from_fn(|g| &groups[g].records[..]);
         let shared = Shared { records, form, a_max: settings.a_max, extra };
         out.stats.block_updates = self.blend(columns as usize, &groups, &shared, options.background, out);
+        drop(groups);
+        let (background, gaussians) = (options.background, scene.len());
+        self.drawn = Some(Drawn { camera: *camera, settings: *settings, background, gaussians });
         Ok(())
     }
 
@@ -295,23 +305,24 @@ impl Renderer {
         let updates = AtomicU64::new(0);
         self.pool.run(columns * rows, &|t, worker| {
             let mut tile = lock(&self.tiles[worker]);
-            let (tx, ty) = (t % columns, t / columns);
-            let place = Place {
-                x: tx * side,
-                y: ty * side,
-                width: side.min(width - tx * side),
-                height: side.min(height - ty * side),
-            };
+            let place = place(t, columns, (width, height));
             tile.clear(place, channels);
             for group in groups {
                 tile.push(group.tile(t));
             }
             self.kernels.enter(Blend { tile: &mut tile, place, shared });
             updates.fetch_add(tile.updates(), Relaxed);
-            lock(&bands[ty]).store(&tile, place, (width, channels), background);
+            lock(&bands[t / columns]).store(&tile, place, (width, channels), background);
         });
         updates.into_inner()
     }
+}
+
+/// Where tile `t` lies in an image of a size.
+pub(crate) fn place(t: usize, columns: usize, (width, height): (usize, usize)) -> Place {
+    let side = TILE as usize;
+    let (x, y) = (t % columns * side, t / columns * side);
+    Place { x, y, width: side.min(width - x), height: side.min(height - y) }
 }
 
 /// Rows of tiles of the highest image.
@@ -381,14 +392,14 @@ fn check_extra<'a>(scene: &Gaussians, extra: Option<Extra<'a>>) -> Result<Channe
 
 // A poisoned lock means that a task panicked; its panic has already reached the caller, and every
 // image starts by clearing what it uses.
-fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
+pub(crate) fn read<T>(lock: &RwLock<T>) -> RwLockReadGuard<'_, T> {
     lock.read().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
+pub(crate) fn write<T>(lock: &RwLock<T>) -> std::sync::RwLockWriteGuard<'_, T> {
     lock.write().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
