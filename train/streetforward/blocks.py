@@ -44,6 +44,7 @@ class Attention(nn.Module):
     def __init__(self, dim, heads, qk_eps=None):
         super().__init__()
         self.heads = heads
+        self.keep = False  # training's matching loss reads the first head's queries and keys
         self.qkv = nn.Linear(dim, 3 * dim)
         if qk_eps is not None:
             self.q_norm = nn.LayerNorm(dim // heads, eps=qk_eps)
@@ -60,6 +61,8 @@ class Attention(nn.Module):
             q, k = self.q_norm(q), self.k_norm(k)
         if rope is not None:
             q, k = rope(q), rope(k)
+        if self.keep:
+            self.kept = q[:, 0], k[:, 0]
         y = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         if mask is not None:
             y = torch.where(mask.any(dim=-1)[:, None], y, torch.zeros_like(y))

@@ -49,6 +49,15 @@ def linear_head(prefix, out, dim, depth, heads):
     }
 
 
+def guided_head(prefix, out, dim, depth, heads, hidden, features):
+    """Pi3's decoder, then convolutions at half resolution that also see the image; sharp edges at small width."""
+    return linear_head(prefix, out, dim, depth, heads) | {
+        f"{prefix}.kind": "guided",
+        f"{prefix}.features": features,
+        f"{prefix}.hidden": hidden,
+    }
+
+
 def dpt_head(prefix, out, taps, channels, features, hidden=32):
     """VGGT's kind: a fusion pyramid over four taps."""
     return no_head(prefix) | {
@@ -77,6 +86,7 @@ def full():
         "rope.base": 100.0,
         "rope.angle_round": "none",
         "head.concat": "frame_global",
+        "guide.channels": 0,
         "camera.dim": 1024,
         "camera.depth": 5,
         "camera.heads": 16,
@@ -116,6 +126,7 @@ def full():
         "render.split": "hard",
         "static.voxel": 0.0,
         "sky.mode": "none",
+        "sky.conf": 0.1,
         "splat.aa": False,
         "splat.a_max": 0.999,
         "splat.eps2d": 0.3,
@@ -142,21 +153,31 @@ def base():
 
 
 def nano():
-    """About 12 M parameters, for demonstrations and tests."""
+    """About 4.2 M parameters: the network that is trained from scratch on generated streets."""
     return full() | {
-        **trunk("encoder", 192, 6, 3, registers=4),
+        **trunk("encoder", 128, 4, 2, registers=4),
         "encoder.pos_grid": 16,
-        **trunk("aa", 192, 8, 3, registers=5),
-        "camera.dim": 192,
+        **trunk("aa", 128, 6, 2, registers=5),
+        "aa.time": True,
+        "guide.channels": 16,
+        "camera.dim": 128,
         "camera.depth": 1,
-        "camera.heads": 3,
+        "camera.heads": 2,
         "camera.width": 128,
-        **linear_head("depth", 3, 192, 1, 3),
+        "camera.k": "fov",
+        **guided_head("depth", 2, 128, 1, 2, hidden=24, features=32),
+        "depth.out_map": "exp_z_conf",
         **no_head("conf"),
-        **dpt_head("gs", 11, [0, 1, 2, 3], [32, 64, 96, 192], 48),
+        **guided_head("gs", 11, 128, 1, 2, hidden=24, features=32),
         "time.d_t": 32,
+        "causal.depth": 2,
         "causal.heads": 4,
-        **dpt_head("motion", 4, [0, 1, 2, 3], [32, 64, 96, 192], 48),
+        **guided_head("motion", 4, 128, 1, 2, hidden=24, features=32),
+        "motion.back_sign": -1,
+        "motion.scale": 5.0,
+        "motion.bias": -2.0,
+        "sky.mode": "far_shell",
+        "sky.conf": 0.5,
     }
 
 
@@ -181,23 +202,28 @@ def preset(name):
 
 
 def with_linear_heads(config):
-    """The same network with its Gaussian and motion heads of the `xdec_linear` kind."""
-    changed = dict(config)
-    for prefix in ("gs", "motion"):
-        if config[f"{prefix}.kind"] != "none":
+    """The same network with its Gaussian, motion and guided heads of the `xdec_linear` kind."""
+    changed = dict(config) | {"guide.channels": 0}
+    for prefix in ("depth", "conf", "gs", "motion"):
+        if config[f"{prefix}.kind"] == "guided" or prefix in ("gs", "motion") and config[f"{prefix}.kind"] != "none":
             width = [config[f"depth.{key}"] for key in ("dim", "depth", "heads")]
             changed |= linear_head(prefix, config[f"{prefix}.out"], *width)
     return changed
 
 
 def head_in(config):
-    """Channels of the features that the camera and the `xdec_linear` heads read."""
+    """Channels of the features that the camera and the heads with a decoder read."""
     return config["aa.dim"] * (2 if config["head.concat"] == "frame_global" else 1)
 
 
 def causal_dim(config):
     """Channels D' inside the causal module: features plus time embedding."""
     return config["aa.dim"] * (2 if config["causal.in"] == "frame_global" else 1) + config["time.d_t"]
+
+
+def guided(config):
+    """Whether any head sees the image."""
+    return any(config[f"{prefix}.kind"] == "guided" for prefix in ("depth", "conf", "gs", "motion"))
 
 
 def has_motion(config):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .config import dpt_head, full, linear_head, no_head, trunk
+from .config import dpt_head, full, guided_head, linear_head, no_head, trunk
 
 
 @dataclass
@@ -210,6 +210,25 @@ CASES = [
             "patch": 14,
             **dpt_head("gs", 11, [0, 0, 1, 1], [4, 8, 8, 4], 8, hidden=8),
             **linear_head("motion", 4, 4, 1, 1),
+        },
+    ),
+    Case(
+        "guided", 13, frames=3, rows=3, columns=4,
+        changes={
+            "patch": 6,
+            "guide.channels": 6,
+            "aa.time": True,
+            "camera.k": "fov",
+            **guided_head("depth", 2, 12, 1, 3, hidden=8, features=10),
+            "depth.out_map": "exp_z_conf",
+            **guided_head("gs", 11, 8, 1, 1, hidden=5, features=12),
+            **guided_head("motion", 4, 16, 1, 2, hidden=6, features=8),
+            "motion.back_sign": -1,
+            "motion.scale": 5.0,
+            "motion.bias": -2.0,
+            "motion.eps": 1e-2,
+            "sky.mode": "far_shell",
+            "sky.conf": 0.5,
         },
     ),
     Case(

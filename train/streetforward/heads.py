@@ -1,4 +1,5 @@
-"""Output heads: transformer decoder with pixel shuffle (Pi3), DPT pyramid (VGGT), camera head (Pi3)."""
+"""Output heads: transformer decoder with pixel shuffle (Pi3), the same with image-guided convolutions, DPT pyramid
+(VGGT), camera head (Pi3)."""
 
 import torch
 import torch.nn.functional as F
@@ -41,6 +42,48 @@ class PixelShuffleHead(nn.Module):
         p, (rows, columns) = self.patch, grid
         x = self.proj(tokens).unflatten(1, (rows, columns)).unflatten(-1, (-1, p, p))  # [F, y, x, c, dy, dx]
         return x.permute(0, 1, 4, 2, 5, 3).flatten(3, 4).flatten(1, 2)
+
+
+class GuidedHead(nn.Module):
+    """Patch tokens to half-resolution features, joined with the image's, refined by 3x3 convolutions.
+
+    `proj` output c*(p/2)^2 + dy*(p/2) + dx is feature c of half-resolution pixel (dy, dx) of its patch; the last
+    convolution's output c*4 + dy*2 + dx is channel c of image pixel (dy, dx) of its half-resolution pixel.
+    """
+
+    def __init__(self, prefix, config):
+        super().__init__()
+        if config["patch"] % 2 or not config["guide.channels"]:
+            raise ValueError(f"{prefix}.kind = guided needs an even patch and guide.channels above 0")
+        self.half = config["patch"] // 2
+        hidden, features = config[f"{prefix}.hidden"], config[f"{prefix}.features"]
+        self.proj = nn.Linear(config[f"{prefix}.dim"], hidden * self.half**2)
+        widths = [
+            (hidden + config["guide.channels"], features),
+            (features, features),
+            (features, features),
+            (features, 4 * config[f"{prefix}.out"]),
+        ]
+        self.conv = nn.ModuleList(nn.Conv2d(a, b, 3, padding=1) for a, b in widths)
+
+    def forward(self, tokens, grid, guide):
+        """tokens [F, P, dim], guide [F, guide, H/2, W/2]; [F, H, W, out]."""
+        x = self.proj(tokens).transpose(1, 2).unflatten(2, grid)
+        x = torch.cat((F.pixel_shuffle(x, self.half), guide), dim=1)
+        x = F.relu(self.conv[0](x))
+        y = F.relu(self.conv[1](x))
+        y = F.relu(x + self.conv[2](y))
+        return F.pixel_shuffle(self.conv[3](y), 2).permute(0, 2, 3, 1)
+
+
+class ImageStem(nn.Conv2d):
+    """What every guided head sees of the image: one strided convolution and ReLU, [F, 3, H, W] to [F, C, H/2, W/2]."""
+
+    def __init__(self, channels):
+        super().__init__(3, channels, 3, stride=2, padding=1)
+
+    def forward(self, x):
+        return F.relu(super().forward(x))
 
 
 def uv_embedding(channels, size, aspect):
@@ -213,10 +256,13 @@ def nearest_rotation(nine):
 def add_head(model, name, prefix, inp, config):
     """Puts the modules of a dense head on `model` under its public tensor names; nothing for kind `none`."""
     kind = config[f"{prefix}.kind"]
-    if kind == "xdec_linear":
+    if kind in ("xdec_linear", "guided"):
         dim, depth, heads = (config[f"{prefix}.{key}"] for key in ("dim", "depth", "heads"))
         setattr(model, f"{name}_decoder", Decoder(inp, dim, depth, heads, dim, config[f"{prefix}.eps"]))
-        setattr(model, f"{name}_head", PixelShuffleHead(dim, config[f"{prefix}.out"], config["patch"]))
+        if kind == "guided":
+            setattr(model, f"{name}_head", GuidedHead(prefix, config))
+        else:
+            setattr(model, f"{name}_head", PixelShuffleHead(dim, config[f"{prefix}.out"], config["patch"]))
     elif kind == "dpt":
         setattr(model, f"{name}_head", DptHead(inp, prefix, config))
     elif kind != "none":

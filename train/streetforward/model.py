@@ -8,7 +8,7 @@ from . import gaussians as g
 from .aggregator import aa_blocks, aggregate, last_features
 from .causal import causal_blocks, pass_ranges, run_pass, time_embedding
 from .encoder import Encoder
-from .heads import CameraHead, Decoder, aa_head_in, add_head, nearest_rotation
+from .heads import CameraHead, Decoder, ImageStem, aa_head_in, add_head, nearest_rotation
 
 
 class StreetForward(nn.Module):
@@ -32,6 +32,8 @@ class StreetForward(nn.Module):
         camera = [config[f"camera.{key}"] for key in ("dim", "depth", "heads", "width")]
         self.camera_decoder = Decoder(cfg.head_in(config), *camera, config["aa.eps"])
         self.camera_head = CameraHead(config)
+        if cfg.guided(config):
+            self.image_stem = ImageStem(config["guide.channels"])
         for name, prefix in (("point", "depth"), ("conf", "conf"), ("gs", "gs")):
             add_head(self, name, prefix, aa_head_in(prefix, config), config)
 
@@ -68,7 +70,9 @@ class StreetForward(nn.Module):
 
         image = images.to(self.dtype) / 255
         mean, std = (torch.tensor(config[f"image.{key}"]).to(image) for key in ("mean", "std"))
-        patches = self.encoder(((image - mean) / std).permute(0, 3, 1, 2), note)
+        normal = ((image - mean) / std).permute(0, 3, 1, 2)
+        patches = self.encoder(normal, note)
+        guide = note("guide", self.image_stem(normal)) if cfg.guided(config) else None
 
         time = None
         if config["time.d_t"]:
@@ -76,17 +80,20 @@ class StreetForward(nn.Module):
         layers = self.alternate(patches, time, grid, note)
 
         translation, nine, fov = self.camera(layers, grid, note)
-        point = note("point", self.points(self.dense("point", "depth", layers, grid)))
+        raw = self.dense("point", "depth", layers, grid, guide)
         conf = None
-        if config["conf.kind"] != "none":
-            conf = note("conf", self.dense("conf", "conf", layers, grid)[..., 0])
+        if config["depth.out_map"] == "exp_z_conf":
+            raw, conf = raw[..., :1], note("conf", raw[..., 1])
+        elif config["conf.kind"] != "none":
+            conf = note("conf", self.dense("conf", "conf", layers, grid, guide)[..., 0])
+        point = note("point", self.points(raw))
         k = note("k", g.intrinsics(point, fov, config))
         own_pose = note("pose", g.raw_poses(nearest_rotation(nine), translation))
         pose = g.anchored_poses(own_pose, config)
         depth = point[..., -1]
 
-        colour, opacity, scale, quat = self.appearance(layers, image, conf, depth, k, pose, grid, note)
-        velocity_fwd, velocity_bwd, dynamic = self.motion(layers, time, times, pose, grid, note)
+        colour, opacity, scale, quat = self.appearance(layers, image, guide, conf, depth, k, pose, grid, note)
+        velocity_fwd, velocity_bwd, dynamic = self.motion(layers, time, times, pose, grid, guide, note)
         scene_depth = depth * config["world.scale"]
         outputs = {
             "pose": pose,
@@ -125,7 +132,7 @@ class StreetForward(nn.Module):
         z = raw[..., -1:].exp()
         return torch.cat((raw[..., :-1] * z, z), dim=-1)
 
-    def dense(self, name, prefix, layers, grid):
+    def dense(self, name, prefix, layers, grid, guide):
         """Raw channels [F, H, W, out] of a head on the alternating-attention features."""
         config, registers = self.config, self.config["aa.registers"]
         if config[f"{prefix}.kind"] == "dpt":
@@ -133,21 +140,22 @@ class StreetForward(nn.Module):
             return getattr(self, f"{name}_head")(pairs, grid, config["patch"])
         tokens = last_features(layers, config["head.concat"])
         tokens = getattr(self, f"{name}_decoder")(tokens, grid, registers, config)
-        return getattr(self, f"{name}_head")(tokens, grid)
+        head = getattr(self, f"{name}_head")
+        return head(tokens, grid, guide) if config[f"{prefix}.kind"] == "guided" else head(tokens, grid)
 
-    def appearance(self, layers, image, conf, depth, k, pose, grid, note):
+    def appearance(self, layers, image, guide, conf, depth, k, pose, grid, note):
         """Colour, opacity, scale and quaternion per pixel; priors alone when there is no Gaussian head."""
         if self.config["gs.kind"] != "none":
-            raw = note("gs.raw", self.dense("gs", "gs", layers, grid))
+            raw = note("gs.raw", self.dense("gs", "gs", layers, grid, guide))
             return g.gaussian_maps(raw, image, depth, k, pose, self.config)
         raw = image.new_zeros(*image.shape[:3], 11)
         priors = self.config | {"gs.out_map": "residual"}
         colour, opacity, scale, quat = g.gaussian_maps(raw, image, depth, k, pose, priors)
         if conf is not None:  # Pi3's own cut
-            opacity = torch.where(conf.sigmoid() < 0.1, torch.zeros_like(opacity), opacity)
+            opacity = torch.where(conf.sigmoid() < self.config["sky.conf"], torch.zeros_like(opacity), opacity)
         return colour, opacity, scale, quat
 
-    def motion(self, layers, time, times, pose, grid, note):
+    def motion(self, layers, time, times, pose, grid, guide, note):
         """Velocities and dynamic probability; zero without a motion head or with one frame alone."""
         config = self.config
         frames, rows, columns = len(times), grid[0] * config["patch"], grid[1] * config["patch"]
@@ -166,12 +174,13 @@ class StreetForward(nn.Module):
             outputs = run_pass(blocks, tokens, reach, grid, config)
             for i, output in enumerate(outputs):
                 note(f"causal.{way}.{i}", output)
-            raw[way] = note(f"motion.{way}", self.motion_raw(outputs, grid))
+            raw[way] = note(f"motion.{way}", self.motion_raw(outputs, grid, guide))
         return g.motion_maps(raw, times, pose, config)
 
-    def motion_raw(self, outputs, grid):
+    def motion_raw(self, outputs, grid, guide):
         """Raw motion channels [F, H, W, out] of one pass."""
         config = self.config
         if config["motion.kind"] == "dpt":
             return self.motion_head([outputs[j] for j in config["motion.taps"]], grid, config["patch"])
-        return self.motion_head(self.motion_decoder(outputs[-1], grid, 0, config), grid)
+        tokens = self.motion_decoder(outputs[-1], grid, 0, config)
+        return self.motion_head(tokens, grid, guide) if config["motion.kind"] == "guided" else self.motion_head(tokens, grid)

@@ -68,6 +68,10 @@ DISCRIMINATES = [
     ("two_sets", "motion.combine", "mean"),
     ("two_sets", "mask.k", 1),
     ("two_sets", "motion.rcu_skip", "relu"),
+    ("guided", "motion.back_sign", 1),
+    ("guided", "motion.scale", 1.0),
+    ("guided", "motion.bias", 0.0),
+    ("guided", "motion.eps", 1e-6),
     ("dggt", "gs.out_map", "residual"),
     ("dggt", "rope.angle_round", "none"),
     ("dggt", "rope.base", 100.0),
@@ -99,7 +103,7 @@ def test_a_checkpoint_is_reproducible_and_describes_itself(tmp_path):
     assert a.read_bytes() == b.read_bytes()
     model = StreetForward(read_config(a))
     model.load_state_dict(load_file(a), strict=True)
-    assert sum(p.numel() for p in model.parameters()) == 11_817_876
+    assert sum(p.numel() for p in model.parameters()) == 4_262_546
     assert (model.motion_head.proj.weight == 0).all()
     images = torch.zeros(2, 28, 42, 3, dtype=torch.uint8)
     with torch.no_grad():

@@ -25,13 +25,13 @@ def test_the_fit_returns_the_camera_the_rays_come_from():
     depth = 1 + 9 * torch.rand(2, 6, 10).double()
     points = camera_points(13.0, 11.0, 6, 10, depth)
     for source in ("fit_shared", "fit_frame"):
-        k = g.intrinsics(points, None, cfg.nano() | {"camera.k": source})
+        k = g.intrinsics(points, None, cfg.base() | {"camera.k": source})
         assert torch.allclose(k, torch.tensor([13.0, 11.0, 5.0, 3.0]).double().expand(2, 4), atol=1e-10)
 
 
 def test_field_of_view_channels_are_logarithms_of_relative_focal_lengths():
     points = torch.ones(1, 6, 10, 1)
-    k = g.intrinsics(points, torch.tensor([[0.0, 1.0]]), cfg.nano() | {"camera.k": "fov"})
+    k = g.intrinsics(points, torch.tensor([[0.0, 1.0]]), cfg.base() | {"camera.k": "fov"})
     assert torch.allclose(k[0], torch.tensor([10.0, 6 * 2.718281828459045, 5.0, 3.0]).double())
 
 
@@ -39,7 +39,7 @@ def test_world_points_reproject_to_their_own_pixels_by_both_routes():
     torch.manual_seed(2)
     depth = 1 + 9 * torch.rand(1, 6, 10).double()
     pose, k = some_pose(), torch.tensor([[13.0, 11.0, 5.0, 3.0]]).double()
-    world = g.unproject(depth, k, pose, cfg.nano())
+    world = g.unproject(depth, k, pose, cfg.base())
     # Camera-to-world turned round is the paper's world-to-camera (R, t): R (mu) + t, then K.
     rotation = pose[0, :3, :3].T
     translation = -rotation @ pose[0, :3, 3]
@@ -52,14 +52,14 @@ def test_world_points_reproject_to_their_own_pixels_by_both_routes():
 def test_integer_pixels_shift_the_rays_by_half_a_pixel():
     depth, pose = torch.ones(1, 4, 4).double(), torch.eye(4).double()[None]
     k = torch.tensor([[2.0, 4.0, 2.0, 2.0]]).double()
-    half = g.unproject(depth, k, pose, cfg.nano())
-    whole = g.unproject(depth, k, pose, cfg.nano() | {"camera.pixel": "integer"})
+    half = g.unproject(depth, k, pose, cfg.base())
+    whole = g.unproject(depth, k, pose, cfg.base() | {"camera.pixel": "integer"})
     assert torch.allclose(half - whole, torch.tensor([0.25, 0.125, 0.0]).double().expand(1, 4, 4, 3))
 
 
 def test_the_first_camera_becomes_the_world():
     pose = torch.cat((some_pose(), some_pose() @ some_pose()))
-    anchored = g.anchored_poses(pose, cfg.nano() | {"world.scale": 3.0})
+    anchored = g.anchored_poses(pose, cfg.base() | {"world.scale": 3.0})
     assert torch.allclose(anchored[0], torch.eye(4).double(), atol=1e-14)
     expected = some_pose()[0].clone()
     expected[:3, 3] *= 3
@@ -85,7 +85,7 @@ def test_zero_channels_give_the_priors():
     image, depth = torch.rand(1, 2, 2, 3).double(), torch.full((1, 2, 2), 6.0).double()
     k = torch.tensor([[8.0, 12.0, 1.0, 1.0]]).double()
     raw = torch.zeros(1, 2, 2, 11).double()
-    config = cfg.nano() | {"world.scale": 2.0}
+    config = cfg.base() | {"world.scale": 2.0}
     colour, opacity, scale, quat = g.gaussian_maps(raw, image, depth, k, some_pose(), config)
     assert torch.equal(colour, image)
     assert torch.allclose(opacity, torch.tensor(1 / (1 + 2.718281828459045**-2)).double().expand(1, 2, 2))
@@ -100,7 +100,7 @@ def test_the_scale_residual_is_clamped():
     raw[..., 4:7] = torch.tensor([9.0, -9.0, 1.0])
     k = torch.tensor([[0.7, 0.7, 0.5, 0.5]]).double()
     one = torch.ones(1, 1, 1).double()
-    scale = g.gaussian_maps(raw, torch.zeros(1, 1, 1, 3).double(), one, k, some_pose(), cfg.nano())[2]
+    scale = g.gaussian_maps(raw, torch.zeros(1, 1, 1, 3).double(), one, k, some_pose(), cfg.base())[2]
     assert torch.allclose(scale.log(), torch.tensor([4.0, -4.0, 1.0]).double())
 
 
@@ -116,7 +116,7 @@ def motion(config_changes, velocity_fwd=1.0, velocity_bwd=10.0, logit=(0.0, 2.0)
         "bwd": torch.cat((velocity_bwd + frame, logit[1] * column), dim=-1),
     }
     pose = torch.eye(4).double().repeat(3, 1, 1)
-    ahead, behind, dynamic = g.motion_maps(raw, TIMES, pose, cfg.nano() | config_changes)
+    ahead, behind, dynamic = g.motion_maps(raw, TIMES, pose, cfg.base() | config_changes)
     return ahead[:, 0, 0, 0].tolist(), behind[:, 0, 0, 0].tolist(), dynamic[:, 0, 0]
 
 
@@ -148,8 +148,8 @@ def test_probabilities_of_known_directions_combine():
 def test_camera_axes_turn_with_the_camera():
     turn = some_pose().repeat(3, 1, 1)
     raw = {way: torch.tensor([1.0, 2.0, 3.0, 0.0]).double().expand(3, 1, 1, 4) for way in ("fwd", "bwd")}
-    in_camera = g.motion_maps(raw, TIMES, turn, cfg.nano())[0][0, 0, 0]
-    in_world = g.motion_maps(raw, TIMES, turn, cfg.nano() | {"motion.frame": "world"})[0][0, 0, 0]
+    in_camera = g.motion_maps(raw, TIMES, turn, cfg.base())[0][0, 0, 0]
+    in_world = g.motion_maps(raw, TIMES, turn, cfg.base() | {"motion.frame": "world"})[0][0, 0, 0]
     assert in_world.tolist() == [1, 2, 3]
     assert torch.allclose(in_camera, turn[0, :3, :3] @ in_world)
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from streetforward import config as cfg
-from streetforward.heads import DptHead, PixelShuffleHead, ResidualUnit, nearest_rotation, uv_embedding
+from streetforward.heads import DptHead, GuidedHead, PixelShuffleHead, ResidualUnit, nearest_rotation, uv_embedding
 
 
 def test_pixel_shuffle_of_a_ramp_gives_the_pixel_coordinates():
@@ -82,3 +82,44 @@ def test_dpt_fills_the_image_at_every_grid(grid):
         out = head(taps, grid, patch=7)
     assert out.shape == (2, 7 * grid[0], 7 * grid[1], 11)
     assert out.isfinite().all()
+
+
+def guided(**changes):
+    config = cfg.nano() | {"patch": 6, "guide.channels": 3}
+    return GuidedHead("x", config | cfg.guided_head("x", 2, 8, 1, 1, hidden=5, features=7) | changes)
+
+
+def test_guided_head_by_the_written_indices():
+    """Both shuffles, the order of the joined channels and the skip, element by element in f64."""
+    torch.manual_seed(2)
+    rows, columns, half = 2, 3, 3
+    head = guided().double()
+    tokens = torch.randn(1, rows * columns, 8, dtype=torch.float64)
+    guide = torch.randn(1, 3, rows * half, columns * half, dtype=torch.float64)
+    with torch.no_grad():
+        image = head(tokens, (rows, columns), guide)
+        flat = head.proj(tokens)[0]
+        x = torch.zeros(1, 8, rows * half, columns * half, dtype=torch.float64)
+        for y in range(rows * half):
+            for z in range(columns * half):
+                token = flat[(y // half) * columns + z // half]
+                for c in range(5):
+                    x[0, c, y, z] = token[c * half * half + (y % half) * half + z % half]
+        x[:, 5:] = guide
+        conv = [lambda t, m=m: torch.conv2d(t, m.weight, m.bias, padding=1) for m in head.conv]
+        x = conv[0](x).relu()
+        y = (x + conv[2](conv[1](x).relu())).relu()
+        out = conv[3](y)[0]
+    assert image.shape == (1, 12, 18, 2)
+    for v in range(12):
+        for u in range(18):
+            for c in range(2):
+                expected = out[c * 4 + (v % 2) * 2 + u % 2, v // 2, u // 2].item()
+                assert image[0, v, u, c].item() == pytest.approx(expected, abs=1e-12)
+
+
+def test_guided_heads_need_an_even_patch_and_a_guide():
+    with pytest.raises(ValueError, match="even patch"):
+        GuidedHead("depth", cfg.nano() | {"patch": 7})
+    with pytest.raises(ValueError, match="guide.channels"):
+        GuidedHead("depth", cfg.nano() | {"guide.channels": 0})
