@@ -1,0 +1,272 @@
+"""Trains a network from scratch on generated streets, on labels.
+
+    python -m streetforward.train --out RUN --cache CLIPS --generator PATH --minutes 100 --ranks 2
+
+Resumes by itself when RUN holds a checkpoint. `docs/training.md` walks through it.
+"""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from . import config as cfg
+from .batched import Wanted, forward_clips
+from .data import Chunks, Loader, Sampler, held_out
+from .evaluate import evaluate, picture
+from .losses import (
+    camera_losses,
+    focal_loss,
+    log_depth_loss,
+    matching_loss,
+    motion_losses,
+    patch_matches,
+    relative,
+    sky_loss,
+)
+from .optim import Optimizer
+from .weights import scratch_start, write_model
+
+KEEP_STILL = ("decoder.1", "decoder.3")  # global layers whose first head is taught to match
+KEEP_MOTION = ("causal.0",)
+
+WEIGHTS = {
+    "depth": 1.0,
+    "slope": 0.5,
+    "sky": 0.2,
+    "rotation": 1.5,
+    "translation": 0.4,
+    "focal": 2.0,
+    "velocity": 0.2,  # per pass, summed over the three axes
+    "dynamic": 0.25,  # per pass
+    "matching": 0.3,  # shared by the supervised heads
+}
+
+
+def learning_rate(fraction, steps, warmup=60, floor=0.03):
+    """Warm-up by steps, then a cosine over the budget down to `floor`."""
+    cosine = floor + (1 - floor) * (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
+    return min(1.0, (steps + 1) / warmup) * cosine
+
+
+def choose(count, frames, first, last, per_clip, generator):
+    """Rows of `per_clip` random frames in first..last of each of `count` clips."""
+    order = torch.rand(count, last - first + 1, generator=generator).argsort(1)[:, :per_clip] + first
+    return (order + frames * torch.arange(count)[:, None]).flatten()
+
+
+def step_losses(model, batch, fraction, args, generator):
+    """All losses of a batch by name, each weighted as it enters the sum."""
+    config = model.config
+    count, frames, height, width = batch.depth.shape
+    moving = fraction >= args.motion_from
+    device = batch.images.device
+    wanted = Wanted(depth=choose(count, frames, 0, frames - 1, args.depth_frames, generator).to(device))
+    keep = KEEP_STILL if args.matching else ()
+    if moving:
+        wanted.motion = {
+            "fwd": choose(count, frames, 0, frames - 2, args.motion_frames, generator).to(device),
+            "bwd": choose(count, frames, 1, frames - 1, args.motion_frames, generator).to(device),
+        }
+        keep += KEEP_MOTION if args.matching else ()
+    with torch.autocast(device.type, torch.bfloat16, enabled=args.bf16):
+        raw = forward_clips(model, batch.images, batch.times, wanted, keep)
+
+    depth = batch.depth.flatten(0, 1)
+    truth = depth[wanted.depth]
+    loss = {}
+    loss["depth"], loss["slope"] = log_depth_loss(raw.depth[..., 0], truth)
+    loss["sky"] = sky_loss(raw.depth[..., 1], truth)
+    loss["rotation"], loss["translation"] = camera_losses(raw.rotation, raw.translation, batch.pose)
+    loss["focal"] = focal_loss(raw.fov, batch.focal, (width, height))
+    if moving:
+        velocity = batch.velocity.flatten(0, 1)
+        loss["velocity"] = loss["dynamic"] = 0
+        for way, rows in wanted.motion.items():
+            sign = config["motion.back_sign"] if way == "bwd" else 1
+            # Backward velocities point where the surface came from; a sign of -1 leaves the head the surface's own.
+            target = velocity[rows] * (sign if way == "fwd" else -sign)
+            value, mask = motion_losses(raw.motion[way], target, depth[rows], config)
+            loss["velocity"], loss["dynamic"] = loss["velocity"] + value, loss["dynamic"] + mask
+    if raw.kept:
+        grid = height // config["patch"], width // config["patch"]
+        matching = matching_loss(raw.kept, patch_matches(batch, config["patch"]), grid)
+        loss |= {f"matching.{name}": value for name, value in matching.items()}
+
+    weighted = {}
+    for name, value in loss.items():
+        weight = WEIGHTS[name.split(".")[0]]
+        if name == "dynamic" and fraction > 2 / 3:
+            weight *= 2
+        if name.startswith("matching."):
+            weight /= len(KEEP_STILL) if "decoder" in name else 2
+        weighted[name] = weight * value
+    return loss, weighted
+
+
+class Run:
+    """One training process: model, optimiser, data, log and checkpoint."""
+
+    def __init__(self, args):
+        self.args = args
+        self.device = torch.device(args.device)
+        width, height = (int(n) for n in args.size.split("x"))
+        config = cfg.preset(args.preset)
+        self.model = scratch_start(config, args.seed).to(self.device)
+        self.model.train()
+        self.optimizer = Optimizer(
+            self.model,
+            lambda name: not name.startswith("gs_"),
+            lr=args.lr,
+            muon_lr=args.muon_lr,
+            ema=args.ema,
+        )
+        self.samples, self.elapsed = 0, 0.0
+        self.reduce = None
+        if args.ranks > 1:
+            self.reduce = torch.distributed.all_reduce
+        checkpoint = args.out / "resume.pt"
+        if checkpoint.exists():
+            state = torch.load(checkpoint, weights_only=True)
+            self.optimizer.load(state["optimizer"])
+            self.samples, self.elapsed = state["samples"], state["elapsed"]
+            self.log(event="resume", samples=self.samples, elapsed=self.elapsed)
+        sampler = Sampler(args.seed, args.window, args.reuse)
+        self.chunks = Chunks(args.generator, args.cache, "train", width, height)
+        self.loader = Loader(self.chunks, sampler, args.batch, self.samples, args.rank, args.ranks)
+        self.records = held_out(Chunks(args.generator, args.cache, "held-out", width, height), args.eval_clips)
+
+    def log(self, **entry):
+        if self.args.rank == 0:
+            entry = {"at": time.strftime("%H:%M:%S"), **entry}
+            text = json.dumps({k: round(v, 5) if isinstance(v, float) else v for k, v in entry.items()})
+            with open(self.args.out / "log.jsonl", "a") as file:
+                file.write(text + "\n")
+            print(text, flush=True)
+
+    def save(self):
+        if self.args.rank == 0:
+            path = self.args.out / "resume.pt"
+            state = {"optimizer": self.optimizer.state(), "samples": self.samples, "elapsed": self.elapsed}
+            torch.save(state, path.with_suffix(".partial"))
+            path.with_suffix(".partial").replace(path)
+
+    def evaluate(self):
+        began = time.time()
+        self.optimizer.swap()
+        entry = evaluate(
+            self.model, self.records, self.device, rank=self.args.rank, ranks=self.args.ranks, reduce=self.reduce
+        )
+        if self.args.rank == 0:
+            picture(self.model, self.records[:4], self.args.out / f"sheet-{self.samples:07}.png", self.device)
+            write_model(self.args.out / "ema.safetensors", self.model)
+        self.optimizer.swap()
+        self.log(event="eval", samples=self.samples, elapsed=self.elapsed, seconds=time.time() - began, **entry)
+
+    def train(self):
+        args, budget = self.args, 60 * self.args.minutes
+        began, mean, last_eval, last_save = time.time() - self.elapsed, {}, self.elapsed, self.elapsed
+        count, log_start, log_samples = 0, time.time(), self.samples
+        clock = torch.zeros(1, dtype=torch.float64)
+        while True:
+            # Rank 0's clock decides for all.
+            clock[0] = time.time() - began
+            if args.ranks > 1:
+                torch.distributed.broadcast(clock, 0)
+            self.elapsed = now = clock.item()
+            fraction = now / budget
+            if fraction >= 1 or (args.steps and self.optimizer.steps >= args.steps):
+                break
+            batch = self.loader.next().to(self.device)
+            generator = torch.Generator().manual_seed((args.seed << 40) + (self.samples << 3) + args.rank)
+            loss, weighted = step_losses(self.model, batch, fraction, args, generator)
+            total = sum(weighted.values())
+            total.backward()
+            scale = learning_rate(fraction, self.optimizer.steps)
+            norm = self.optimizer.step(scale, args.rank, args.ranks, self.reduce)
+            self.samples += args.batch
+            count += 1
+            values = {name: float(value.detach()) for name, value in loss.items()}
+            for name, value in (values | {"total": float(total.detach()), "norm": norm}).items():
+                a, n = mean.get(name, (0.0, 0))
+                mean[name] = a + value, n + 1
+            if count % args.log_every == 0:
+                rate = (self.samples - log_samples) / (time.time() - log_start)
+                means = {name: a / n for name, (a, n) in mean.items()}
+                self.log(step=self.optimizer.steps, samples=self.samples, elapsed=now, lr=scale, rate=rate, **means)
+                mean, log_start, log_samples = {}, time.time(), self.samples
+            if now - last_save > 60 * args.save_minutes:
+                self.save()
+                last_save = now
+            if now - last_eval > 60 * args.eval_minutes:
+                self.evaluate()
+                last_eval = now
+                log_start, log_samples = time.time(), self.samples
+        self.save()
+        self.evaluate()
+
+
+def parser():
+    p = argparse.ArgumentParser(prog="streetforward.train", description=__doc__.splitlines()[0])
+    p.add_argument("--out", type=Path, required=True, help="folder of the run: log, sheets, checkpoint")
+    p.add_argument("--cache", type=Path, required=True, help="folder for generated clips")
+    p.add_argument("--generator", type=Path, required=True, help="the clip generator's `stream` example")
+    p.add_argument("--preset", default="nano")
+    p.add_argument("--size", default="168x112")
+    p.add_argument("--seed", type=int, default=1)
+    p.add_argument("--minutes", type=float, default=100, help="training time of the whole schedule, resumptions added up")
+    p.add_argument("--steps", type=int, default=0, help="stop after this many steps; 0: only time counts")
+    p.add_argument("--batch", type=int, default=4)
+    p.add_argument("--ranks", type=int, default=1, help="processes that share a batch and average gradients")
+    p.add_argument("--rank", type=int, default=0, help=argparse.SUPPRESS)
+    p.add_argument("--threads", type=int, default=1, help="threads of each process")
+    p.add_argument("--device", default="cpu")
+    p.add_argument("--bf16", action="store_true", help="bf16 autocast; needs bf16 units to be faster")
+    p.add_argument("--lr", type=float, default=1e-3)
+    p.add_argument("--muon-lr", type=float, default=2e-3)
+    p.add_argument("--ema", type=float, default=0.999)
+    p.add_argument("--window", type=int, default=1024)
+    p.add_argument("--reuse", type=float, default=3.0)
+    p.add_argument("--motion-from", type=float, default=0.3, help="part of the schedule without motion")
+    p.add_argument("--depth-frames", type=int, default=2, help="frames of a clip whose depth is computed")
+    p.add_argument("--motion-frames", type=int, default=2, help="frames of a clip and pass whose motion is computed")
+    p.add_argument("--no-matching", dest="matching", action="store_false")
+    p.add_argument("--eval-clips", type=int, default=96)
+    p.add_argument("--eval-minutes", type=float, default=10)
+    p.add_argument("--save-minutes", type=float, default=3)
+    p.add_argument("--log-every", type=int, default=20)
+    return p
+
+
+def main(argv=None):
+    args = parser().parse_args(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(args.threads)
+    others = []
+    if args.ranks > 1:
+        os.environ.setdefault("MASTER_ADDR", "127.0.0.1")
+        os.environ.setdefault("MASTER_PORT", "29511")
+        if args.rank == 0:
+            given = list(sys.argv[1:] if argv is None else argv)
+            for rank in range(1, args.ranks):
+                command = [sys.executable, "-m", "streetforward.train", *given, "--rank", str(rank)]
+                others.append(subprocess.Popen(command))
+        torch.distributed.init_process_group("gloo", rank=args.rank, world_size=args.ranks)
+    try:
+        Run(args).train()
+    except BaseException:
+        for process in others:
+            process.terminate()
+        raise
+    for process in others:
+        process.wait()
+
+
+if __name__ == "__main__":
+    main()
