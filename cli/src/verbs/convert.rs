@@ -21,11 +21,11 @@ pub(crate) struct Args {
     inputs: Vec<PathBuf>,
     #[command(flatten)]
     file: FileArgs,
-    /// Precision of the weight matrices; sensitive ones stay f32
+    /// Precision of the weight matrices; sensitive ones stay f32 or f16
     #[arg(long, value_enum, default_value_t = Precision::F32)]
     to: Precision,
-    /// Exceptions by the start of a tensor's name, as gs_head.=f32,decoder.0.=f16
-    #[arg(long, value_name = "PREFIX=PRECISION", value_delimiter = ',', value_parser = keep)]
+    /// Exceptions by the start of a tensor's name, * and ? as wildcards, as gs_head.=f32,decoder.*.mlp.fc2=f16
+    #[arg(long, value_name = "PATTERN=PRECISION", value_delimiter = ',', value_parser = keep)]
     keep: Vec<(String, Dtype)>,
     /// JSON file of settings for a checkpoint that carries none
     #[arg(long, value_name = "FILE")]
@@ -95,6 +95,8 @@ fn to_json(args: &Args, report: &Report) -> Value {
             "initialised": t.origin == sf_quant::report::Origin::Initialised,
             "promoted": t.promoted,
             "zero_outputs": t.zero_outputs,
+            "weight_sqnr_db": t.sqnr_db,
+            "reason": t.reason,
         })
     };
     json!({

@@ -36,7 +36,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         return Err(Error::usage(format!("{}: the output ends in .sfw or .safetensors", escape_path(output))));
     }
     if !blob && args.to != Precision::F32 {
-        return Err(Error::usage("--to f16 is for .sfw outputs; a checkpoint is f32"));
+        return Err(Error::usage("--to is for .sfw outputs; a checkpoint is f32"));
     }
     let seeded = Seeded::new(&config, args.seed, Outputs::Random)?;
     signals::guard_file(output);
