@@ -5,8 +5,9 @@
 //! permuting the frames permutes the result. After a pair whose features a head reads, its two
 //! outputs are kept side by side: `[frames * tokens, 2 dim]`, frame features left for frame-first order.
 
-use crate::block::{self, Net, Sight};
+use crate::block::{self, Sight};
 use crate::embed;
+use crate::net::Net;
 use crate::plan::Plan;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};

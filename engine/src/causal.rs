@@ -7,13 +7,14 @@
 //! once, which is exact because only the mask differs.
 
 use crate::arena::{carve, carved_len};
-use crate::block::{self, BlockShape, Net, Sight};
+use crate::block::{self, BlockShape, Sight};
 use crate::dims::Dims;
 use crate::embed;
 use crate::features::Features;
 use crate::heads::{self, Dense, Source};
 use crate::model::{Block, DenseHead, Model};
 use crate::motion::Reach;
+use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens, causal_tokens};
 use sf_formats::Result;
@@ -22,7 +23,7 @@ use sf_ops::attention::FrameMask;
 use sf_ops::mat::Mat;
 
 /// Tokens per frame.
-fn tokens(config: &ModelConfig, d: &Dims) -> usize {
+pub(crate) fn tokens(config: &ModelConfig, d: &Dims) -> usize {
     match causal_tokens(config) {
         Tokens::WithRegisters => d.tokens,
         Tokens::Patches => d.patches,
@@ -46,8 +47,9 @@ fn lens(model: &Model, d: &Dims, threads: usize) -> [usize; 5] {
     let (config, w) = (model.config(), model.weights());
     let values = d.frames * tokens(config, d) * config.causal_dim() as usize;
     let (fwd, bwd) = Reach::of(config);
-    let shape = BlockShape::of(&w.causal[0], threads);
-    let block = [Some(fwd), bwd].into_iter().flatten().map(|r| shape.scratch_len(&mask(config, d, r))).max();
+    let most = |r, blocks| BlockShape::most(blocks, &mask(config, d, r), threads);
+    let back = w.causal_back.as_ref().unwrap_or(&w.causal);
+    let block = [Some(most(fwd, &w.causal)), bwd.map(|r| most(r, back))].into_iter().flatten().max();
     let motion = w.motion.as_ref().map_or(0, |head| heads::scratch_len(head, d, d.patches, threads));
     let scratch = block.unwrap_or(0).max(motion).max(values);
     let shared = if w.causal_back.is_none() { 3 * values } else { 0 };

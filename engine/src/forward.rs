@@ -5,7 +5,6 @@
 
 use crate::aggregator;
 use crate::arena::carve;
-use crate::block::Net;
 use crate::dims::{ClipShape, Dims};
 use crate::features::{Features, Pairs};
 use crate::heads::camera::{self, RawCamera};
@@ -13,6 +12,7 @@ use crate::heads::{self, Dense, Source};
 use crate::input::Input;
 use crate::intrinsics::{self, Evidence};
 use crate::model::{DenseHead, Model};
+use crate::net::Net;
 use crate::output::{Flags, Output};
 use crate::plan::{Plan, trunk_lens};
 use crate::probe::Probe;

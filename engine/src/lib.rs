@@ -10,7 +10,7 @@
 //! | `forward.rs` | the order of the network |
 //! | `encoder.rs` | DINOv2 with registers, frame by frame |
 //! | `aggregator.rs` | alternating frame and global attention |
-//! | `block.rs` | the one transformer block |
+//! | `block.rs` `net.rs` | the one transformer block; linear layers of every precision |
 //! | `features.rs` | the tokens that heads read, where they lie |
 //! | `heads/` | camera, linear, guided and DPT heads |
 //! | `causal.rs` | the two masked passes over time |
@@ -58,6 +58,7 @@ mod input;
 mod intrinsics;
 mod model;
 mod motion;
+mod net;
 mod output;
 mod plan;
 pub mod preprocess;

@@ -13,10 +13,10 @@
 //! RCU(x) = conv2(relu(conv1(relu(x)))) + relu(x), or + x with the `raw` skip.
 
 use crate::arena::{carve, carved_len};
-use crate::block::Net;
 use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::{Dpt, Linear, Unit};
+use crate::net::Net;
 use crate::tables::DptTables;
 use sf_formats::config::RcuSkip;
 use sf_ops::conv::{self, Conv, ConvTranspose};
