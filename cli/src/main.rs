@@ -11,6 +11,7 @@
 //! | `model.rs` | the model of a verb: blob, checkpoint, or random weights |
 //! | `reconstruct.rs` | clip and model to network output |
 //! | `results.rs` | network output to files |
+//! | `versus.rs` | one model against another: `compare` and the checks of `convert` |
 //! | `views.rs` | cameras for `render`: along the clip, fixed, in orbit, displaced |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
@@ -27,6 +28,7 @@ mod reconstruct;
 mod results;
 mod signals;
 mod verbs;
+mod versus;
 mod views;
 
 use clap::Parser;
