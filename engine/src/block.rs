@@ -5,13 +5,13 @@
 //! x += ls2 * fc2(gelu(fc1(norm2 x)))
 //! ```
 //!
-//! Optional parts (q/k norms, layer scale, rotary embedding) are absent where the weights or the caller
+//! In blocks whose q|k|v and output projections are int8, attention is int8, too. Optional parts (q/k norms, layer scale, rotary embedding) are absent where the weights or the caller
 //! have none. x is `[rows, dim]`, dense, rows = frames * tokens of the mask.
 
 use crate::arena::{carve, carved_len};
 use crate::model::Block;
 use crate::net::Net;
-use sf_ops::attention::{self, FrameMask};
+use sf_ops::attention::{self, FrameMask, Heads};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Mat, MatMut};
 use sf_ops::rope::{QkNorm, RopeTable, qk_norm_rope};
@@ -22,6 +22,8 @@ pub(crate) struct BlockShape {
     pub(crate) dim: usize,
     pub(crate) heads: usize,
     pub(crate) hidden: usize,
+    /// Whether attention is int8.
+    pub(crate) attention_s8: bool,
     /// Whether normed tokens exist as floats: int8 layers take them quantized in the same pass.
     pub(crate) normed: bool,
     pub(crate) threads: usize,
@@ -30,7 +32,8 @@ pub(crate) struct BlockShape {
 impl BlockShape {
     pub(crate) fn of(block: &Block, threads: usize) -> BlockShape {
         let normed = !(block.qkv.weight.is_int8() && block.fc1.weight.is_int8());
-        BlockShape { dim: block.dim, heads: block.heads, hidden: block.hidden, normed, threads }
+        let attention_s8 = block.int8_attention();
+        BlockShape { dim: block.dim, heads: block.heads, hidden: block.hidden, attention_s8, normed, threads }
     }
 
     /// Most working memory of [`forward`] with any of the blocks.
@@ -43,7 +46,8 @@ impl BlockShape {
     fn lens(&self, mask: &FrameMask) -> [usize; 3] {
         let rows = mask.frames * mask.tokens;
         let wide = carved_len(self.attention_lens(rows)).max(rows * self.hidden);
-        let scratch = attention::scratch_len(mask, self.heads, self.dim / self.heads, self.threads);
+        let len = if self.attention_s8 { attention::scratch_len_s8 } else { attention::scratch_len };
+        let scratch = len(mask, self.heads, self.dim / self.heads, self.threads);
         [if self.normed { rows * self.dim } else { 0 }, wide, scratch]
     }
 
@@ -72,34 +76,38 @@ pub(crate) fn forward(net: Net, block: &Block, x: &mut [f32], sight: Sight, scra
     {
         let [qkv, mixed] = carve(wide, shape.attention_lens(rows));
         project(net, block, Mat::new(x, rows, dim), sight.rope, normed, qkv);
-        attend(net, block, qkv, sight.mask, Attend { x, mixed, heads });
+        attend(net, block, qkv, sight, Attend { x, mixed, heads });
     }
     mlp(net, block, x, rows, normed, wide);
 }
 
 /// [`forward`] from a q|k|v that was computed before: two passes over the same input share it.
-pub(crate) fn forward_from(net: Net, block: &Block, qkv: &[f32], x: &mut [f32], mask: FrameMask, scratch: &mut [f32]) {
-    let rows = mask.frames * mask.tokens;
+pub(crate) fn forward_from(net: Net, block: &Block, qkv: &[f32], x: &mut [f32], sight: Sight, scratch: &mut [f32]) {
+    let rows = sight.mask.frames * sight.mask.tokens;
     let shape = BlockShape::of(block, net.ctx.pool.threads());
-    let [normed, wide, heads] = carve(scratch, shape.lens(&mask));
-    attend(net, block, qkv, mask, Attend { x, mixed: &mut wide[..rows * block.dim], heads });
+    let [normed, wide, heads] = carve(scratch, shape.lens(&sight.mask));
+    attend(net, block, qkv, sight, Attend { x, mixed: &mut wide[..rows * block.dim], heads });
     mlp(net, block, x, rows, normed, wide);
 }
 
-/// q|k|v of x, `[rows, 3 dim]`, normed and rotated. `normed` is working memory as large as x, or none for an int8 layer.
+/// q|k|v of x, `[rows, 3 dim]`, normed and with positions unless attention is int8, which does that itself. `normed` is working memory as large as x, or none for an int8 layer.
 pub(crate) fn project(net: Net, block: &Block, x: Mat, rope: Option<&RopeTable>, normed: &mut [f32], qkv: &mut [f32]) {
     let (rows, dim) = (x.rows, block.dim);
     net.normed_linear(&block.norm1, &block.qkv, Act::None, (x, normed), MatMut::new(qkv, rows, 3 * dim));
-    let norm = block.qk.as_ref().map(|(q, k)| QkNorm {
+    let norm = head_norm(net, block);
+    if !block.int8_attention() && (norm.is_some() || rope.is_some()) {
+        qk_norm_rope(net.ctx, MatMut::new(qkv, rows, 3 * dim), block.heads, norm, rope);
+    }
+}
+
+fn head_norm<'a>(net: Net<'a>, block: &Block) -> Option<QkNorm<'a>> {
+    block.qk.as_ref().map(|(q, k)| QkNorm {
         q_gain: net.model.values(q.gain),
         q_offset: net.model.values(q.offset),
         k_gain: net.model.values(k.gain),
         k_offset: net.model.values(k.offset),
         eps: q.eps,
-    });
-    if norm.is_some() || rope.is_some() {
-        qk_norm_rope(net.ctx, MatMut::new(qkv, rows, 3 * dim), block.heads, norm, rope);
-    }
+    })
 }
 
 struct Attend<'a> {
@@ -109,10 +117,17 @@ struct Attend<'a> {
 }
 
 /// x += ls1 * proj(attention(qkv)).
-fn attend(net: Net, block: &Block, qkv: &[f32], mask: FrameMask, to: Attend) {
+fn attend(net: Net, block: &Block, qkv: &[f32], sight: Sight, to: Attend) {
+    let Sight { mask, rope } = sight;
     let (rows, dim) = (mask.frames * mask.tokens, block.dim);
-    let mixed = MatMut::new(to.mixed, rows, dim);
-    attention::attention(net.ctx, Mat::new(qkv, rows, 3 * dim), block.heads, mask, to.heads, mixed);
+    let (qkv, mixed) = (Mat::new(qkv, rows, 3 * dim), MatMut::new(to.mixed, rows, dim));
+    if block.int8_attention() {
+        let rotation = net.model.head_rotation(&block.proj.weight, dim / block.heads);
+        let x = Heads { qkv, heads: block.heads, norm: head_norm(net, block), rope, rotation };
+        attention::attention_s8(net.ctx, x, mask, to.heads, mixed);
+    } else {
+        attention::attention(net.ctx, qkv, block.heads, mask, to.heads, mixed);
+    }
     net.linear_onto(&block.proj, Act::None, block.ls1, Mat::new(to.mixed, rows, dim), MatMut::new(to.x, rows, dim));
 }
 

@@ -161,12 +161,11 @@ impl Pass<'_> {
         let kept = taps(self.net.model);
         let dim = self.blocks[0].dim;
         for (i, block) in self.blocks.iter().enumerate() {
+            let rope = self.tables.rope(dim / block.heads, causal_tokens(self.net.model.config()));
+            let sight = Sight { mask: self.mask, rope: Some(rope) };
             match (i, shared) {
-                (0, Some(qkv)) => block::forward_from(self.net, block, qkv, x, self.mask, scratch),
-                _ => {
-                    let rope = self.tables.rope(dim / block.heads, causal_tokens(self.net.model.config()));
-                    block::forward(self.net, block, x, Sight { mask: self.mask, rope: Some(rope) }, scratch);
-                }
+                (0, Some(qkv)) => block::forward_from(self.net, block, qkv, x, sight, scratch),
+                _ => block::forward(self.net, block, x, sight, scratch),
             }
             probe.layer(format_args!("causal.{}.{i}", self.name), x)?;
             if let Some(slot) = kept.iter().position(|&t| t == i) {

@@ -9,6 +9,7 @@ use sf_formats::config::{Head, HeadKind, KSource, ModelConfig, RcuSkip, Trunk};
 use sf_formats::{Error, Result};
 use sf_ops::gemm::{PanelData, Panels, PanelsS8};
 use sf_ops::hadamard::Rotation;
+use sf_ops::simd::LANES;
 use std::path::Path;
 
 /// A matrix in panels, `[n, k]`.
@@ -74,6 +75,13 @@ pub(crate) struct Block {
     pub(crate) fc1: Linear, // [hidden, dim]
     pub(crate) fc2: Linear, // [dim, hidden]
     pub(crate) ls2: Option<VecRef>,
+}
+
+impl Block {
+    /// Whether attention runs in int8: the layers around it do.
+    pub(crate) fn int8_attention(&self) -> bool {
+        self.qkv.weight.is_int8() && self.proj.weight.is_int8()
+    }
 }
 
 /// Pi3's decoder: projection, blocks, projection.
@@ -258,6 +266,13 @@ impl Model {
             }
         };
         Weight::Float(Panels { n: r.n, k: r.k, data })
+    }
+
+    /// The rotation of heads of width `d` in front of int8 scores: the first signs of the output projection, for any
+    /// random ones will do. None where the width has none.
+    pub(crate) fn head_rotation(&self, proj: &PanelRef, d: usize) -> Option<Rotation<'_>> {
+        let signs = self.blob.int8(proj.tensor).signs;
+        (d.is_multiple_of(LANES) && signs.len() >= d / LANES).then(|| Rotation::new(d, &signs[..d / LANES]))
     }
 
     /// The panels behind the handle of a convolution, which is never int8.

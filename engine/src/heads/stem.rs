@@ -6,8 +6,8 @@
 
 use crate::dims::Dims;
 use crate::model::Linear;
-use crate::preprocess::Normaliser;
 use crate::net::Net;
+use crate::preprocess::Normaliser;
 use crate::probe::Probe;
 use sf_formats::Result;
 use sf_ops::conv::{self, Conv};
