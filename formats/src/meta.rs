@@ -28,6 +28,10 @@ pub mod keys {
     pub const PRECISION: &str = "precision";
     /// SHA-256 of what the network predicts for a fixed clip, hexadecimal.
     pub const GOLDEN: &str = "golden.digest";
+    /// Names of the measurements of [`CHECK_VALUES`], comma-separated.
+    pub const CHECK_KEYS: &str = "check.keys";
+    /// What the converter measured against the f32 model on clips; -1 where there was nothing to measure.
+    pub const CHECK_VALUES: &str = "check.values";
     /// What the quantizer did, in words.
     pub const QUANT_RECIPE: &str = "quant.recipe";
     /// One line per matrix that is not int8: name, type, reason.

@@ -31,8 +31,12 @@ pub struct Options {
     pub precision: Dtype,
     /// Exceptions by the start of the name (`*` and `?` as wildcards), first match wins; they concern matrices.
     pub keep: Vec<(String, Dtype)>,
+    /// Names of matrices that int8 is too coarse for: stored as f16.
+    pub promoted: Vec<String>,
     /// Whether the blob gets a place for the digest of a golden run ([`keys::GOLDEN`]), which the caller fills in.
     pub golden: bool,
+    /// Names of measurements for which the blob gets places ([`keys::CHECK_VALUES`]), which the caller fills in.
+    pub checks: Vec<String>,
     /// Configuration for a checkpoint that carries none.
     pub config: Option<ModelConfig>,
     /// Prefixes of tensors that may be missing; they start neutral.
@@ -49,7 +53,9 @@ impl Options {
         Options {
             precision,
             keep: Vec::new(),
+            promoted: Vec::new(),
             golden: false,
+            checks: Vec::new(),
             config: None,
             allow_missing: Vec::new(),
             licence: None,
@@ -60,6 +66,12 @@ impl Options {
 
 /// int8 weights below this signal-to-error ratio are stored as f16: some row is dominated by few huge values.
 pub const WEIGHT_FLOOR_DB: f64 = 30.0;
+
+/// Reason of a matrix of [`Options::promoted`].
+pub const SCAN_REASON: &str = "sensitivity scan";
+
+/// Where no golden run has been made.
+pub const NO_DIGEST: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 
 /// What the quantizer does, for the blob's provenance.
 const RECIPE: &str = "weights: symmetric int8 per output, least-squares step, rotated by a random-sign block Hadamard; norms \
@@ -237,7 +249,12 @@ fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Repo
         if let Some(k) = kept {
             used[k] = true;
         }
-        choices.push(recipe::choose(&config, spec, options.precision, kept.map(|k| &options.keep[k])));
+        choices.push(recipe::choose(
+            &config,
+            spec,
+            options.precision,
+            (kept.map(|k| &options.keep[k]), options.promoted.contains(&spec.name)),
+        ));
     }
     let folding = recipe::fold(&specs, &choices);
     let (mut jobs, mut tensors) = (Vec::new(), Vec::new());
@@ -444,7 +461,11 @@ fn provenance(source: &dyn Checkpoint, options: &Options, report: &mut Report) -
         meta.set_text(keys::LICENCE, licence);
     }
     if options.golden {
-        meta.set_text(keys::GOLDEN, &"0".repeat(64));
+        meta.set_text(keys::GOLDEN, NO_DIGEST);
+    }
+    if !options.checks.is_empty() {
+        meta.set_text(keys::CHECK_KEYS, &options.checks.join(","));
+        meta.set(keys::CHECK_VALUES, Value::Floats(vec![0.0; options.checks.len()]));
     }
     if options.precision == Dtype::Int8 {
         meta.set_text(keys::QUANT_RECIPE, RECIPE);
@@ -530,7 +551,7 @@ fn write_float(values: &[f32], dtype: Dtype, writer: &mut BlobWriter, row: &mut 
 
 /// Writes a matrix as int8, or (folded all the same) as f16 where int8 would be too coarse.
 fn write_int8(job: &Job, loaded: &Loaded, writer: &mut BlobWriter, row: &mut TensorReport) -> Result<()> {
-    let q: Quantized = quantize::quantize(&job.spec, &loaded.values, &loaded.fold);
+    let q: Quantized = quantize::quantize(&job.spec, &loaded.values, &loaded.fold, recipe::is_rotated(&job.spec));
     row.sqnr_db = Some(q.sqnr_db());
     if q.sqnr_db() >= WEIGHT_FLOOR_DB || q.signal == 0.0 {
         row.bytes = writer.write_int8(QuantizedMatrix { values: &q.values, scales: &q.scales, signs: &q.signs })?;

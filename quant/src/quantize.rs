@@ -107,15 +107,16 @@ pub fn folded_bias(spec: &TensorSpec, weight: &[f32], fold: &Fold, bias: &[f32])
     (0..n).map(folded).collect()
 }
 
-/// Quantizes a matrix whose input width can be rotated ([`rotation_block`]); `values` in checkpoint order.
+/// Quantizes a matrix; `values` in checkpoint order. With a rotation its input width must have one
+/// ([`rotation_block`]).
 ///
 /// Rows are independent: any number of threads gives the same result.
-pub fn quantize(spec: &TensorSpec, values: &[f32], fold: &Fold) -> Quantized {
+pub fn quantize(spec: &TensorSpec, values: &[f32], fold: &Fold, rotated: bool) -> Quantized {
     let order = Order::of(spec).unwrap_or_else(|| panic!("{} is no matrix", spec.name));
     let (n, k) = spec.matrix().expect("as above");
-    let width = rotated_width(spec).filter(|&w| rotation_block(w).is_some());
-    let width = width.unwrap_or_else(|| panic!("the inputs of {} {:?} cannot be rotated", spec.name, spec.shape));
-    let signs = signs(width);
+    let width = rotated_width(spec).expect("a matrix has inputs");
+    assert!(!rotated || rotation_block(width).is_some(), "a rotation of the inputs of {} {:?}", spec.name, spec.shape);
+    let signs = if rotated { signs(width) } else { Vec::new() };
     let (mut out, mut scales) = (vec![0i8; n * k], vec![0.0f32; n]);
     let sums: Vec<(f64, f64)> = (out.par_chunks_exact_mut(k), scales.par_iter_mut())
         .into_par_iter()
@@ -124,7 +125,9 @@ pub fn quantize(spec: &TensorSpec, values: &[f32], fold: &Fold) -> Quantized {
             || vec![0.0f64; k],
             |row, (o, (to, scale))| {
                 folded_row(values, &order, fold, o, row);
-                row.chunks_exact_mut(width).for_each(|channels| rotate(channels, &signs));
+                if rotated {
+                    row.chunks_exact_mut(width).for_each(|channels| rotate(channels, &signs));
+                }
                 let (best, signal, noise) = quantize_row(row, to);
                 *scale = best;
                 (signal, noise)
@@ -238,7 +241,7 @@ mod tests {
             let w = random(n * k, "w");
             let (gain, offset, gamma) = (random(k, "gain"), random(k, "offset"), random(n, "gamma"));
             let fold = Fold { gain: Some(gain.clone()), offset: Some(offset.clone()), gamma: Some(gamma.clone()) };
-            let q = quantize(&spec, &w, &fold);
+            let q = quantize(&spec, &w, &fold, true);
             let bias = random(n, "bias");
             let folded = folded_bias(&spec, &w, &fold, &bias);
             let order = Order::of(&spec).unwrap();

@@ -5,18 +5,19 @@
 //! | camera head; last layer of every head | f32 | f32 | tiny, and their errors reach poses, log depth and velocities unweakened |
 //! | patch embedding, time embedding | f16 | f16 | inputs of 588 and d_t values that no norm precedes; under 1 % of the work |
 //! | input width that is no multiple of 16 | f16 | f16 | has no rotation |
-//! | convolutions with a window | f16 | f16 | their int8 form does not exist |
+//! | convolutions | f16 | f16 | their int8 form does not exist |
 //! | everything else | f16 | int8 | |
 //!
 //! Folding ([`Sources`]) concerns int8 matrices: a norm's gain and offset go into every matrix that reads it when all
 //! of them are int8, a layer scale into the matrix in front. The norm and the scale stay in the file as ones
 //! and zeros, so that the network is the same for every reader.
 
+use crate::convert::SCAN_REASON;
 use crate::names::glob;
 use crate::seeded::output_layer;
-use sf_formats::{Dtype, ModelConfig};
 use sf_formats::arch::{Role, TensorSpec};
 use sf_formats::panel_s8::{Int8Layout, rotated_width, rotation_block};
+use sf_formats::{Dtype, ModelConfig};
 use std::collections::BTreeMap;
 
 /// The type of one tensor, and why it is not the one asked for.
@@ -31,8 +32,13 @@ pub(crate) fn names(pattern: &str, name: &str) -> bool {
     glob(&format!("{pattern}*"), name)
 }
 
-/// The type of a tensor; exceptions first.
-pub(crate) fn choose(config: &ModelConfig, spec: &TensorSpec, asked: Dtype, kept: Option<&(String, Dtype)>) -> Choice {
+/// The type of a tensor; exceptions and what a scan promoted first.
+pub(crate) fn choose(
+    config: &ModelConfig,
+    spec: &TensorSpec,
+    asked: Dtype,
+    (kept, promoted): (Option<&(String, Dtype)>, bool),
+) -> Choice {
     let plain = |dtype| Choice { dtype, reason: None };
     let because = |dtype, why: &str| Choice { dtype, reason: Some(why.to_string()) };
     if spec.matrix().is_none() {
@@ -46,6 +52,9 @@ pub(crate) fn choose(config: &ModelConfig, spec: &TensorSpec, asked: Dtype, kept
             Some(why) => because(Dtype::F16, why),
             None => plain(Dtype::Int8),
         };
+    }
+    if promoted {
+        return because(Dtype::F16, SCAN_REASON);
     }
     if spec.name.starts_with("camera_head.") {
         return because(Dtype::F32, "camera head");
@@ -70,18 +79,24 @@ pub(crate) fn choose(config: &ModelConfig, spec: &TensorSpec, asked: Dtype, kept
     }
 }
 
+/// Whether a matrix multiplies tokens: linear layers, and the 1x1 convolutions that run as such.
+fn is_linear(spec: &TensorSpec) -> bool {
+    spec.role == Role::Linear || spec.name.contains("_head.projects.")
+}
+
+/// Whether the inputs of an int8 matrix are rotated: tokens are, maps are not.
+pub(crate) fn is_rotated(spec: &TensorSpec) -> bool {
+    is_linear(spec)
+}
+
 /// Why a matrix cannot be int8.
 fn unfit(spec: &TensorSpec) -> Option<&'static str> {
-    let window = spec.shape[2..].iter().any(|&side| side > 1);
-    if window {
-        return Some("convolution with a window");
+    if !is_linear(spec) {
+        return Some("convolution");
     }
     let width = rotated_width(spec)?;
-    if rotation_block(width).is_none() || Int8Layout::of(spec, true).is_none() {
-        return Some("input width without a rotation");
-    }
-    // A 1x1 convolution that is no linear layer of the engine.
-    (spec.role != Role::Linear && !spec.name.contains("_head.projects.")).then_some("convolution")
+    let fits = rotation_block(width).is_some() && Int8Layout::of(spec, true).is_some();
+    (!fits).then_some("input width without a rotation")
 }
 
 /// Indices of the vectors that are folded into a matrix.
@@ -171,7 +186,7 @@ mod tests {
 
     fn planned(config: &ModelConfig, asked: Dtype) -> (Vec<TensorSpec>, Vec<Choice>, Folding) {
         let specs = arch::tensors(config);
-        let choices: Vec<Choice> = specs.iter().map(|s| choose(config, s, asked, None)).collect();
+        let choices: Vec<Choice> = specs.iter().map(|s| choose(config, s, asked, (None, false))).collect();
         let folding = fold(&specs, &choices);
         (specs, choices, folding)
     }
@@ -206,11 +221,13 @@ mod tests {
 
     #[test]
     fn a_norm_with_a_float_reader_stays() {
-        let config = ModelConfig::nano();
+        let config = ModelConfig::base();
         let specs = arch::tensors(&config);
         let kept = ("gs_head.projects.2".to_string(), Dtype::F16);
-        let choices: Vec<Choice> =
-            specs.iter().map(|s| choose(&config, s, Dtype::Int8, names(&kept.0, &s.name).then_some(&kept))).collect();
+        let choices: Vec<Choice> = specs
+            .iter()
+            .map(|s| choose(&config, s, Dtype::Int8, (names(&kept.0, &s.name).then_some(&kept), false)))
+            .collect();
         let folding = fold(&specs, &choices);
         let at = |name: &str| specs.iter().position(|s| s.name == name).unwrap();
         assert!(!folding.neutral.contains_key(&at("gs_head.norm.weight")));
