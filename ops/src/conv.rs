@@ -9,6 +9,7 @@ use crate::cpu::{Ctx, Kernels};
 use crate::gemm::pack::{Change, MAX_MR, RowPack};
 use crate::gemm::{Act, AddTo, NR, Panels, Product, RowSink, Rows, Sink, Source, product};
 use crate::mat::{Hwc, HwcMut};
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 
 /// A convolution layer.
@@ -126,6 +127,7 @@ pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut)
     let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
     let sink = RowSink { out: SharedMut::new(out.data), stride: weight.n, add };
     let (bias, act) = (conv.bias, conv.act);
+    let _span = opclock::span(Op::Conv, || Work::product(oh * ow, &weight, x.h * x.w * x.c));
     product(ctx, &Product { m: oh * ow, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }
 
@@ -169,6 +171,7 @@ pub fn conv_transpose(ctx: Ctx, x: Hwc, conv: &ConvTranspose, out: HwcMut) {
     assert!(bias.is_none_or(|b| b.len() == out.c), "bias of {} outputs", out.c);
     let (m, act) = (x.h * x.w, Act::None);
     let source = Rows(x.as_mat());
+    let _span = opclock::span(Op::Conv, || Work::product(m, &weight, m * x.c));
     let sink = Scatter { w: x.w, kernel, line: kernel * out.c, out: SharedMut::new(out.data) };
     product(ctx, &Product { m, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }
