@@ -30,7 +30,8 @@ pub(crate) fn tokens(config: &ModelConfig, d: &Dims) -> usize {
     }
 }
 
-fn mask(config: &ModelConfig, d: &Dims, reach: Reach) -> FrameMask {
+/// What each query of a pass sees.
+pub(crate) fn mask(config: &ModelConfig, d: &Dims, reach: Reach) -> FrameMask {
     FrameMask { frames: d.frames, tokens: tokens(config, d), lo: reach.lo, hi: reach.hi }
 }
 
@@ -98,15 +99,21 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
     for ((name, reach, blocks), raw) in passes.into_iter().zip(job.raw.chunks_exact_mut(map_len)) {
         let Some(reach) = reach else { continue };
         x.copy_from_slice(start);
-        // A direction without a neighbour mirrors the other one: its map is never read, so only a tap wants it.
-        let unread = config.render_extrapolate == Extrapolate::Mirror && bwd.is_some() && !probe.tapped();
-        let pass = Pass { net, d, tables, guide: job.guide, mask: mask(config, d, reach), blocks, reach, unread, name };
+        let pass = Pass { net, d, tables, guide: job.guide, mask: mask(config, d, reach), blocks, reach, name };
         let shared = w.causal_back.is_none().then_some(&*shared);
         pass.layers(shared, x, tapped, scratch, probe)?;
+        probe.lap("causal");
         pass.motion(x, tapped, scratch, raw, probe)?;
+        probe.lap("motion");
     }
-    probe.lap("motion");
     Ok(())
+}
+
+/// Whether the map of frame `f` in a pass that reaches this far is read: a direction without a neighbour mirrors the
+/// other one, where there is another.
+pub(crate) fn is_read(config: &ModelConfig, reach: Reach, f: usize, frames: usize) -> bool {
+    let mirrored = config.render_extrapolate == Extrapolate::Mirror && Reach::of(config).1.is_some();
+    !mirrored || reach.has_neighbour(f, frames)
 }
 
 /// Features and time embedding side by side.
@@ -143,8 +150,6 @@ struct Pass<'a> {
     mask: FrameMask,
     blocks: &'a [Block],
     reach: Reach,
-    /// Whether maps of frames without a neighbour in this direction go unread.
-    unread: bool,
     name: &'static str,
 }
 
@@ -210,7 +215,8 @@ impl Pass<'_> {
         dense.prepare(source, scratch, probe)?;
         let out = heads::channels(head);
         for (f, map) in raw.chunks_exact_mut(d.pixels() * out).enumerate() {
-            if self.unread && !self.reach.has_neighbour(f, d.frames) {
+            // Only a tap wants a map that is never read.
+            if !is_read(self.net.model.config(), self.reach, f, d.frames) && !probe.tapped() {
                 continue;
             }
             dense.frame(source, f, scratch, map);

@@ -6,6 +6,7 @@
 //! | `session.rs` | [`Session`]: a model ready for clips of one shape; [`Options`] |
 //! | `dims.rs` | [`ClipShape`]: what a session is made for, checked once; its token counts |
 //! | `plan.rs` `arena.rs` | [`Plan`]: every size before the first frame; the one block of memory |
+//! | `cost.rs` | [`Cost`]: the multiply-adds of a run, stage by stage |
 //! | `input.rs` `preprocess.rs` | [`Input`]: frames at the network's size; resizing to it |
 //! | `forward.rs` | the order of the network |
 //! | `encoder.rs` | DINOv2 with registers, frame by frame |
@@ -47,6 +48,7 @@ mod aggregator;
 mod arena;
 mod block;
 mod causal;
+mod cost;
 mod dims;
 mod embed;
 mod encoder;
@@ -69,6 +71,7 @@ mod session;
 mod tables;
 mod unproject;
 
+pub use cost::{Cost, StageCost};
 pub use dims::{ClipShape, MAX_FRAMES, MAX_PIXELS, MAX_TOKENS};
 pub use input::Input;
 pub use model::Model;

@@ -129,6 +129,28 @@ impl Plan {
     pub fn output_bytes(&self) -> u64 {
         4 * self.output_values as u64
     }
+
+    /// Bytes of the frames that a run reads.
+    pub fn input_bytes(&self) -> u64 {
+        3 * (self.dims.frames * self.dims.pixels()) as u64
+    }
+
+    /// Bytes of the scene made of the results, one Gaussian per pixel: centre, scale, quaternion, opacity, colour,
+    /// two velocities, dynamic probability, source frame.
+    pub fn scene_bytes(&self) -> u64 {
+        4 * (3 + 3 + 4 + 1 + 3 + 3 + 3 + 1 + 1) * (self.dims.frames * self.dims.pixels()) as u64
+    }
+
+    /// Bytes of the arena's areas by name.
+    pub fn areas_bytes(&self) -> Vec<(&'static str, u64)> {
+        let names = ["pairs", "guide", "motion", "work"];
+        names.into_iter().zip(self.areas).map(|(name, values)| (name, 4 * values as u64)).collect()
+    }
+
+    /// Bytes of working memory that each stage asks for; the area holds the largest.
+    pub fn work_bytes(&self) -> Vec<(&'static str, u64)> {
+        self.stages.iter().map(|&(name, values)| (name, 4 * values as u64)).collect()
+    }
 }
 
 /// Transformer blocks that a run of `frames` frames goes through; a causal block counts once per pass.

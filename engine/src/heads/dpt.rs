@@ -26,16 +26,17 @@ use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
 use sf_ops::resize::{Corners, bilinear};
 
 /// Height and width.
-type Size = (usize, usize);
+pub(crate) type Size = (usize, usize);
 
 /// Sizes of the four levels, finest first.
-fn levels(d: &Dims) -> [Size; 4] {
+pub(crate) fn levels(d: &Dims) -> [Size; 4] {
     let half = |n| conv::conv_out(n, 3, 2, 1);
     let (r, c) = (d.rows, d.cols);
     [(4 * r, 4 * c), (2 * r, 2 * c), (r, c), (half(r), half(c))]
 }
 
-fn area(s: Size) -> usize {
+/// Pixels of a level.
+pub(crate) fn area(s: Size) -> usize {
     s.0 * s.1
 }
 
