@@ -133,7 +133,7 @@ fn main() {
     let threads = number(2).map_or(vec![1, 2], |n| vec![n]);
     let only = std::env::args().nth(3);
     let wanted = |&(m, k, n): &(usize, usize, usize)| only.as_ref().is_none_or(|o| *o == format!("{m}x{k}x{n}"));
-    println!("{}, {rounds} rounds", Kernels::best().gemm_s8.name);
+    println!("{}, {rounds} rounds", Kernels::best().product_s8.name);
     println!("threads     M     K     N        ms    GOP/s  of peak  with gelu");
     let mut cases: Vec<Case> = SHAPES.into_iter().filter(wanted).map(Case::new).collect();
     for threads in threads {

@@ -161,8 +161,10 @@ pub struct Kernels {
     pub gemm_f32: &'static GemmKernel,
     /// Matrix product with f16 weights.
     pub gemm_f16: &'static GemmKernel,
-    /// Matrix product with int8 activations and weights.
+    /// Matrix product with int8 activations and weights, activations as bytes: attention, products of few rows.
     pub gemm_s8: &'static GemmS8Kernel,
+    /// The same for products of many rows and for convolutions; another row where widened activations are faster.
+    pub product_s8: &'static GemmS8Kernel,
     /// Element-wise and row-wise operations.
     pub vector: &'static VectorKernels,
 }
@@ -176,7 +178,11 @@ impl Kernels {
             features,
             gemm_f32: gemm(WeightType::F32).expect("a scalar row ends the table"),
             gemm_f16: gemm(WeightType::F16).expect("a scalar row ends the table"),
-            gemm_s8: GEMM_S8.iter().find(|k| features.has(k.needs)).expect("a scalar row ends the table"),
+            gemm_s8: GEMM_S8
+                .iter()
+                .find(|k| k.bytes == 1 && features.has(k.needs))
+                .expect("a scalar row ends the table"),
+            product_s8: GEMM_S8.iter().find(|k| features.has(k.needs)).expect("a scalar row ends the table"),
             vector: VECTOR.iter().find(|k| features.has(k.needs)).expect("a scalar row ends the table"),
         }
     }
@@ -365,7 +371,11 @@ mod tests {
             assert!(Features::detected().has(k.features));
             assert!(k.isa.features().has(k.features));
             assert!(k.features.has(k.gemm_f32.needs) && k.features.has(k.vector.needs));
-            assert!(k.features.has(k.gemm_f16.needs) && k.features.has(k.gemm_s8.needs));
+            assert!(
+                k.features.has(k.gemm_f16.needs)
+                    && k.features.has(k.gemm_s8.needs)
+                    && k.features.has(k.product_s8.needs)
+            );
         }
         let foreign = if cfg!(target_arch = "x86_64") { Isa::Neon } else { Isa::Avx2 };
         let e = Kernels::capped(foreign).unwrap_err();

@@ -7,12 +7,12 @@
 //! The rotation's factor 1/sqrt(block) multiplies the scale instead of the values: the integers do not change with it.
 //! Everything happens in one pass over a row that stays in the first-level cache.
 
+use crate::activation::relu_lanes;
 use crate::cpu::Ctx;
-use crate::gemm::s8::pack::{RowsS8Mut, padded_k};
+use crate::gemm::s8::pack::{QUAD, RowsS8Mut, padded_k};
 use crate::hadamard::{Rotation, rotate};
 use crate::layernorm::{NormRow, moments, norm_row};
 use crate::mat::Mat;
-use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector, padded};
 
@@ -61,20 +61,21 @@ fn standardize<S: Simd>(s: S, x: &[f32], eps: f32, out: &mut [f32]) {
     }
 }
 
-/// (max |x|, whether every value is finite).
+/// (max |x|, whether every value is finite); of the rectified values with `relu`.
 #[inline(always)]
-fn largest<S: Simd>(s: S, x: &[f32]) -> (f32, bool) {
+fn largest<S: Simd>(s: S, x: &[f32], relu: bool) -> (f32, bool) {
     let (blocks, tail) = x.as_chunks::<LANES>();
     let zero = s.splat(0.0);
     // x * 0 is NaN for NaN and infinities and stays so; the maximum drops NaN.
     let (mut max, mut odd) = (zero, zero);
     for b in blocks {
-        let v = s.load(b);
+        let v = if relu { relu_lanes(s, s.load(b)) } else { s.load(b) };
         max = v.abs().max(max);
         odd = v.mul_add(zero, odd);
     }
     if !tail.is_empty() {
         let v = s.load(&padded(tail, 0.0));
+        let v = if relu { relu_lanes(s, v) } else { v };
         max = v.abs().max(max);
         odd = v.mul_add(zero, odd);
     }
@@ -111,7 +112,7 @@ pub(crate) fn quantize_row<S: Simd>(s: S, row: QuantizeRow) -> f32 {
         factor = rotation.normalizer();
     }
     let x = if changed { &*work } else { x };
-    let (max, finite) = largest(s, x);
+    let (max, finite) = largest(s, x, false);
     let inverse = 127.0 / max;
     if !finite || !inverse.is_finite() {
         out.fill(0);
@@ -131,6 +132,194 @@ pub(crate) fn quantize_row<S: Simd>(s: S, row: QuantizeRow) -> f32 {
         None => yt.copy_from_slice(&bytes[..yt.len()]),
     }
     max / 127.0 * factor
+}
+
+/// max |x|, of the rectified values with `relu`; NaN when a value is not finite.
+#[inline(always)]
+pub(crate) fn largest_body<S: Simd>(s: S, x: &[f32], relu: bool) -> f32 {
+    let (max, finite) = largest(s, x, relu);
+    if finite { max } else { f32::NAN }
+}
+
+/// The larger of two maxima; NaN stays.
+pub(crate) fn larger(a: f32, b: f32) -> f32 {
+    if a.is_nan() || a > b { a } else { b }
+}
+
+/// (127 / max, max / 127) for values up to `max`; 0 and the scale 0 where that cannot be divided, 0 and NaN for NaN.
+#[inline(always)]
+pub(crate) fn inverse_and_scale(max: f32) -> (f32, f32) {
+    let inverse = 127.0 / max;
+    if inverse.is_finite() { (inverse, max / 127.0) } else { (0.0, if max.is_nan() { max } else { 0.0 }) }
+}
+
+/// Where quantized pixels go, in the form that an int8 kernel takes.
+pub(crate) enum MapOut<'a> {
+    /// Bytes, after an exclusive-or: 0x80 turns s8 into s8 + 128 as u8, 0 keeps.
+    Bytes(&'a mut [i8], u8),
+    /// Widened to sixteen bits.
+    Wide(&'a mut [i16]),
+}
+
+impl MapOut<'_> {
+    /// A piece.
+    pub(crate) fn slice(&mut self, range: std::ops::Range<usize>) -> MapOut<'_> {
+        match self {
+            MapOut::Bytes(out, flip) => MapOut::Bytes(&mut out[range], *flip),
+            MapOut::Wide(out) => MapOut::Wide(&mut out[range]),
+        }
+    }
+
+    /// Zeros everywhere.
+    pub(crate) fn clear(&mut self) {
+        match self {
+            MapOut::Bytes(out, flip) => out.fill(*flip as i8),
+            MapOut::Wide(out) => out.fill(0),
+        }
+    }
+}
+
+/// Steps of pixels that go into a map.
+pub(crate) enum MapScale<'a> {
+    /// 127 / max of all of them; 0 for zeros.
+    Inverse(f32),
+    /// Each pixel's own, to be written here.
+    PerPixel(&'a mut [f32]),
+}
+
+/// Pixels of a line to be quantized into a map.
+pub(crate) struct ToMap<'a> {
+    /// `[pixels][c]`.
+    pub x: &'a [f32],
+    /// Channels.
+    pub c: usize,
+    /// Whether values are rectified first.
+    pub relu: bool,
+    /// Their steps.
+    pub scale: MapScale<'a>,
+    /// `[pixels][c padded to four]`.
+    pub out: MapOut<'a>,
+}
+
+/// A value of a map. Functions, not closures: those lose the instruction set where they are not inlined.
+trait MapValue: Copy {
+    /// Of sixteen bytes.
+    fn of(bytes: &[i8; LANES], flip: u8) -> [Self; LANES];
+}
+
+impl MapValue for i8 {
+    #[inline(always)]
+    fn of(bytes: &[i8; LANES], flip: u8) -> [i8; LANES] {
+        let mut values = *bytes;
+        for v in &mut values {
+            *v ^= flip as i8;
+        }
+        values
+    }
+}
+
+impl MapValue for i16 {
+    #[inline(always)]
+    fn of(bytes: &[i8; LANES], _flip: u8) -> [i16; LANES] {
+        let mut values = [0; LANES];
+        for i in 0..LANES {
+            values[i] = i16::from(bytes[i]);
+        }
+        values
+    }
+}
+
+/// Quantizes the pixels of a line.
+#[inline(always)]
+pub(crate) fn to_map<S: Simd>(s: S, t: ToMap) {
+    let ToMap { x, c, relu, scale, out } = t;
+    match out {
+        MapOut::Bytes(out, flip) => pixels(s, (x, c, relu), scale, out, flip),
+        MapOut::Wide(out) => pixels(s, (x, c, relu), scale, out, 0),
+    }
+}
+
+/// Quantizes pixels.
+#[inline(always)]
+fn pixels<S: Simd, T: MapValue>(s: S, (x, c, relu): (&[f32], usize, bool), scale: MapScale, out: &mut [T], flip: u8) {
+    let width = padded_k(c);
+    match scale {
+        // Nothing between the pixels: one run.
+        MapScale::Inverse(inverse) if width == c => quantize_run(s, x, relu, inverse, out, flip),
+        MapScale::Inverse(inverse) if c < QUAD => quantize_few(s, (x, c, relu), inverse, out, flip),
+        MapScale::Inverse(inverse) => {
+            for (x, out) in x.chunks_exact(c).zip(out.chunks_exact_mut(width)) {
+                quantize_run(s, x, relu, inverse, out, flip);
+            }
+        }
+        MapScale::PerPixel(scales) => {
+            for ((x, out), scale) in x.chunks_exact(c).zip(out.chunks_exact_mut(width)).zip(scales) {
+                let (inverse, step) = inverse_and_scale(largest_body(s, x, relu));
+                *scale = step;
+                quantize_run(s, x, relu, inverse, out, flip);
+            }
+        }
+    }
+}
+
+/// Sixteen quantized values; an inverse of 0 gives zeros.
+#[inline(always)]
+fn quantized<S: Simd>(s: S, v: S::V, relu: bool, inverse: f32) -> [i8; LANES] {
+    let mut bytes = [0i8; LANES];
+    if inverse != 0.0 {
+        let v = if relu { relu_lanes(s, v) } else { v };
+        clamp(s, v * s.splat(inverse)).store_s8(&mut bytes);
+    }
+    bytes
+}
+
+/// Quantizes values side by side; `out` may be up to three values longer, which become zeros.
+#[inline(always)]
+fn quantize_run<S: Simd, T: MapValue>(s: S, x: &[f32], relu: bool, inverse: f32, out: &mut [T], flip: u8) {
+    let (xb, xt) = x.as_chunks::<LANES>();
+    let (yb, yt) = out.as_chunks_mut::<LANES>();
+    for (x, y) in xb.iter().zip(yb.iter_mut()) {
+        *y = T::of(&quantized(s, s.load(x), relu, inverse), flip);
+    }
+    // What is left: less than 16 values, or a whole 16 of which x has 13 to 15.
+    let rest = yb.get_mut(xb.len());
+    if xt.is_empty() && rest.is_none() && yt.is_empty() {
+        return;
+    }
+    let tail = T::of(&quantized(s, s.load(&padded(xt, 0.0)), relu, inverse), flip);
+    match rest {
+        Some(y) => *y = tail,
+        None => yt.copy_from_slice(&tail[..yt.len()]),
+    }
+}
+
+/// Quantizes pixels of up to three channels: sixteen values at a time, whatever pixels they belong to.
+#[inline(always)]
+fn quantize_few<S: Simd, T: MapValue>(
+    s: S,
+    (x, c, relu): (&[f32], usize, bool),
+    inverse: f32,
+    out: &mut [T],
+    flip: u8,
+) {
+    let zero = T::of(&[0; LANES], flip)[0];
+    // Sixteen pixels are c whole vectors.
+    for (x, out) in x.chunks(LANES * c).zip(out.chunks_mut(LANES * QUAD)) {
+        let mut values = [[zero; LANES]; QUAD];
+        for (x, values) in x.chunks(LANES).zip(&mut values) {
+            let v = match x.first_chunk::<LANES>() {
+                Some(x) => s.load(x),
+                None => s.load(&padded(x, 0.0)),
+            };
+            *values = T::of(&quantized(s, v, relu, inverse), flip);
+        }
+        let values = values.as_flattened();
+        for (i, pixel) in out.as_chunks_mut::<QUAD>().0.iter_mut().enumerate() {
+            for ch in 0..QUAD {
+                pixel[ch] = if ch < c { values[i * c + ch] } else { zero };
+            }
+        }
+    }
 }
 
 /// Values of one task: about 64 KiB.
@@ -158,7 +347,6 @@ pub fn quantize(ctx: Ctx, x: Mat, before: Before, out: RowsS8Mut) {
         out.scales.fill(0.0);
         return;
     }
-    let _span = opclock::span(Op::Quantize, || Work { macs: 0, bytes: (5 * rows * cols) as u64 });
     let per_task = (TASK / cols).max(1);
     let (bytes, scales) = (SharedMut::new(out.data), SharedMut::new(out.scales));
     ctx.pool.reserve_scratch(cols);

@@ -10,8 +10,15 @@ use sf_ops::gemm::{Epilogue, GEMM_F, GEMM_S8, Panels, PanelsS8, RowsS8, WeightTy
 use sf_ops::{Kernels, Mat, MatMut, par::Pool};
 use std::process::Command;
 
-/// The one instruction of each kernel family that does the work.
-const WORK: [&str; 3] = ["vfmadd", "vpdpbusd", "vpmaddubsw"];
+/// The one instruction that does the work of a kernel of instruction set `isa`.
+fn work(entry: &str, isa: &str) -> &'static str {
+    match (entry, isa) {
+        ("gemm_s8" | "conv_s8", "avx2") => "vpmaddubsw",
+        ("gemm_s8" | "conv_s8", "avx2wide") => "vpmaddwd",
+        ("gemm_s8" | "conv_s8", _) => "vpdpbusd",
+        _ => "vfmadd",
+    }
+}
 
 /// What the tables of both families say of a kernel.
 struct Tile {
@@ -40,7 +47,7 @@ fn spills(line: &str) -> bool {
 }
 
 /// Loops of one function's listing, without those that hold another loop's jump.
-fn loops(lines: &[&str]) -> Vec<Loop> {
+fn loops(lines: &[&str], work: &str) -> Vec<Loop> {
     let mut found = Vec::new();
     for (i, line) in lines.iter().enumerate() {
         let mut words = line.split('\t').nth(1).unwrap_or("").split_whitespace();
@@ -52,7 +59,7 @@ fn loops(lines: &[&str]) -> Vec<Loop> {
         let Some(start) = lines[..i].iter().position(|l| address(l) == Some(target)) else { continue };
         let body = &lines[start..=i];
         found.push(Loop {
-            multiply_adds: body.iter().filter(|l| WORK.iter().any(|w| l.contains(w))).count(),
+            multiply_adds: body.iter().filter(|l| l.contains(work)).count(),
             clean: !body.iter().any(|l| l.contains("call") || spills(l)),
         });
     }
@@ -79,11 +86,15 @@ fn tiles_are_tight_loops() {
     };
     let text = String::from_utf8(dump.stdout).unwrap();
     let lines: Vec<&str> = text.lines().collect();
-    let float = GEMM_F.iter().map(|r| {
-        let entry = if r.weights == WeightType::F32 { "gemm_f32" } else { "gemm_f16" };
-        Tile { name: r.name, entry, rows: r.rows, mr: r.mr, nr: r.nr }
+    // Packed rows, and windows in place.
+    let float = GEMM_F.iter().flat_map(|r| {
+        let f16 = r.weights == WeightType::F16;
+        let entries = if f16 { ["gemm_f16", "conv_f16"] } else { ["gemm_f32", "conv_f32"] };
+        entries.map(|entry| Tile { name: r.name, entry, rows: r.rows, mr: r.mr, nr: r.nr })
     });
-    let int8 = GEMM_S8.iter().map(|r| Tile { name: r.name, entry: "gemm_s8", rows: r.rows, mr: r.mr, nr: r.nr });
+    let int8 = GEMM_S8.iter().flat_map(|r| {
+        ["gemm_s8", "conv_s8"].map(|entry| Tile { name: r.name, entry, rows: r.rows, mr: r.mr, nr: r.nr })
+    });
     for row in float.chain(int8).filter(|r| !r.name.ends_with("_scalar")) {
         let isa = row.name.rsplit('_').next().unwrap();
         // The mangled name holds module and function with their lengths: `6avx512`, not `10avx512vnni`.
@@ -91,18 +102,19 @@ fn tiles_are_tight_loops() {
         let start = lines
             .iter()
             .position(|l| l.ends_with(">:") && l.contains(&module) && l.contains(row.entry))
-            .unwrap_or_else(|| panic!("{} is not in the binary", row.name));
+            .unwrap_or_else(|| panic!("{} {} is not in the binary", row.name, row.entry));
         let end = lines[start..].iter().position(|l| l.is_empty()).map_or(lines.len(), |n| start + n);
-        let loops = loops(&lines[start..end]);
+        let loops = loops(&lines[start..end], work(row.entry, isa));
         // AVX2 and AVX-VNNI vectors of 16 lanes are two registers.
         let registers = row.nr / if isa.starts_with("avx512") { 16 } else { 8 };
         for rows in row.rows {
             // The compiler may unroll small tiles.
             let wanted = rows * registers;
             let tight = loops.iter().any(|l| l.clean && l.multiply_adds > 0 && l.multiply_adds % wanted == 0);
-            assert!(tight, "{}: no tight loop for {rows} rows ({wanted} multiply-adds)", row.name);
+            assert!(tight, "{} {}: no tight loop for {rows} rows ({wanted} multiply-adds)", row.name, row.entry);
         }
         let full = row.mr * registers;
-        assert!(loops.iter().any(|l| l.clean && l.multiply_adds == full), "{}: full tile of {full}", row.name);
+        let tight = loops.iter().any(|l| l.clean && l.multiply_adds == full);
+        assert!(tight, "{} {}: full tile of {full}", row.name, row.entry);
     }
 }

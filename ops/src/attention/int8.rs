@@ -40,7 +40,6 @@ use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::hadamard::Rotation;
 use crate::mat::{Mat, MatMut};
-use crate::opclock::{self, Op};
 use crate::par::SharedMut;
 use crate::rope::{QkNorm, RopeTable};
 use crate::simd::LANES;
@@ -521,7 +520,6 @@ pub(crate) fn run(ctx: Ctx, x: Heads, mask: FrameMask, scratch: &mut [f32], out:
     if x.qkv.rows == 0 {
         return;
     }
-    let _span = opclock::span(Op::AttentionS8, || super::work(&mask, x.heads * d));
     let skip = scratch.as_ptr().align_offset(LINE * size_of::<f32>()).min(LINE);
     let job = Job { kernels: ctx.kernels, x, d, mask, room: Room::new(tokens, d), watch };
     let (unit_len, worker_len) = (job.room.unit(), job.room.worker);
@@ -571,6 +569,7 @@ mod tests {
     }
 
     impl Dot8 for Wide {
+        type Elem = i8;
         type W = [i8; STEP];
         type A = [u8; QUAD];
         type Acc = [i32; LANES];
@@ -579,15 +578,15 @@ mod tests {
             [0; LANES]
         }
 
-        fn load(self, x: &[i32; LANES]) -> [i32; LANES] {
+        fn load(self, _pass: usize, x: &[i32; LANES]) -> [i32; LANES] {
             *x
         }
 
-        fn store(self, acc: [i32; LANES], x: &mut [i32; LANES]) {
+        fn store(self, _pass: usize, acc: [i32; LANES], x: &mut [i32; LANES]) {
             *x = acc;
         }
 
-        fn load_w(self, x: &[i8; STEP]) -> [i8; STEP] {
+        fn load_w(self, _pass: usize, x: &[i8; STEP]) -> [i8; STEP] {
             *x
         }
 
@@ -609,7 +608,9 @@ mod tests {
         nr: 32,
         rows: &[1, 2, 4, 6, 8, 10, 12],
         activations: Activations::Offset128,
+        bytes: 1,
         run: gemm_s8,
+        windows: conv_s8,
         peak: peak_s8,
     };
 

@@ -7,7 +7,6 @@ pub(crate) mod tile;
 
 use crate::cpu::{Ctx, Kernels};
 use crate::mat::{Mat, MatMut};
-use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use pack::{Change, MAX_MR, RowPack, strided};
 use tile::{Finish, Tile};
@@ -133,16 +132,16 @@ const PACKED: usize = 1 << 16;
 /// Most tiles of rows per task.
 const TILES: usize = 8;
 /// Steps of k between which a panel pair stays in the first-level cache: 256 * 32 columns = 32 KiB of f32.
-const KC: usize = 256;
+pub(crate) const KC: usize = 256;
 /// Tasks wanted, so that a few threads finish together.
 const TASKS: usize = 16;
 /// Fewest panels per task: packing the rows again costs about 2 % of 64 columns' multiply-adds.
 const GROUP: usize = 4;
 /// Panels of the widest kernel.
-const MAX_NV: usize = 2;
+pub(crate) const MAX_NV: usize = 2;
 
-/// Most f32 values of working memory that each thread of the pool keeps after products (or convolutions) of up to
-/// `k` inputs, whatever the kernel; for memory plans.
+/// Most f32 values of working memory that each thread of the pool keeps after products (or convolutions whose windows do not
+/// overlap) of up to `k` inputs, whatever the kernel; for memory plans.
 pub fn working_memory(k: usize) -> usize {
     PACKED.max(MAX_MR * k) + TILES * MAX_MR * MAX_NV * NR
 }
@@ -198,6 +197,19 @@ struct Columns {
     panels: usize,
 }
 
+/// Values of the columns of a group of panels, zeros beyond n; they repeat with their length as period.
+pub(crate) fn per_column(values: Option<&[f32]>, panel: usize, n: usize) -> [[f32; NR]; MAX_NV] {
+    let mut lanes = [[0.0f32; NR]; MAX_NV];
+    if let Some(values) = values {
+        for (i, lane) in lanes.as_flattened_mut().iter_mut().enumerate() {
+            if panel * NR + i < n {
+                *lane = values[(panel * NR + i) % values.len()];
+            }
+        }
+    }
+    lanes
+}
+
 fn columns(kernels: &Kernels, p: &Product, c: Columns, packed: &[f32], acc: &mut [f32]) {
     let kernel = kernels.gemm(p.w.data.weights());
     let (n, k, mr) = (p.w.n, p.w.k, kernel.mr);
@@ -225,17 +237,8 @@ fn columns(kernels: &Kernels, p: &Product, c: Columns, packed: &[f32], acc: &mut
             });
         }
     }
-    let mut bias = [[0.0f32; NR]; MAX_NV];
-    let mut gamma = [[0.0f32; NR]; MAX_NV];
-    for v in 0..c.panels {
-        for l in 0..NR {
-            let col = (c.panel + v) * NR + l;
-            if col < n {
-                bias[v][l] = p.bias.map_or(0.0, |b| b[col % b.len()]);
-                gamma[v][l] = p.gamma.map_or(0.0, |g| g[col]);
-            }
-        }
-    }
+    let bias = per_column(p.bias, c.panel, n);
+    let gamma = per_column(p.gamma, c.panel, n);
     kernels.finish(Finish {
         acc: &mut *acc,
         acc_stride: stride,
@@ -266,6 +269,5 @@ pub fn gemm(ctx: Ctx, a: Mat, w: Panels, ep: Epilogue, out: MatMut) {
     let stride = out.stride;
     let sink = RowSink { out: SharedMut::new(out.data), stride, add };
     let source = Rows(a);
-    let _span = opclock::span(Op::Gemm, || Work::product(a.rows, &w, a.rows * a.cols));
     product(ctx, &Product { m: a.rows, source: &source, w, bias: ep.bias, act: ep.act, gamma: ep.gamma, sink: &sink });
 }

@@ -2,7 +2,7 @@
 //! when it has a row here.
 #![allow(unsafe_code)]
 
-use super::tile::Tile;
+use super::tile::{Tile, Windows};
 use crate::cpu::{Features, Kernels};
 #[cfg(target_arch = "aarch64")]
 use crate::simd::neon;
@@ -34,7 +34,9 @@ pub struct GemmKernel {
     pub nr: usize,
     /// Row counts it can run, ascending; the last is `mr`. Fewer rows are packed up to the next one.
     pub rows: &'static [usize],
-    pub(crate) run: unsafe fn(Tile),
+    pub(crate) run: unsafe fn(Tile, ()),
+    /// The tile on windows in place.
+    pub(crate) windows: unsafe fn(Tile, Windows),
 }
 
 impl GemmKernel {
@@ -58,6 +60,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 32,
         rows: &[1, 2, 4, 6, 8, 10, 12],
         run: avx512::gemm_f32,
+        windows: avx512::conv_f32,
     },
     #[cfg(target_arch = "x86_64")]
     GemmKernel {
@@ -68,6 +71,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 32,
         rows: &[1, 2, 4, 6, 8, 10, 12],
         run: avx512::gemm_f16,
+        windows: avx512::conv_f16,
     },
     #[cfg(target_arch = "x86_64")]
     GemmKernel {
@@ -78,6 +82,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         run: avx2::gemm_f32,
+        windows: avx2::conv_f32,
     },
     #[cfg(target_arch = "x86_64")]
     GemmKernel {
@@ -88,6 +93,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         run: avx2::gemm_f16,
+        windows: avx2::conv_f16,
     },
     #[cfg(target_arch = "aarch64")]
     GemmKernel {
@@ -98,6 +104,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         run: neon::gemm_f32,
+        windows: neon::conv_f32,
     },
     #[cfg(target_arch = "aarch64")]
     GemmKernel {
@@ -108,6 +115,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         run: neon::gemm_f16,
+        windows: neon::conv_f16,
     },
     GemmKernel {
         name: "gemm_f32_4x16_scalar",
@@ -117,6 +125,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 4],
         run: scalar::gemm_f32,
+        windows: scalar::conv_f32,
     },
     GemmKernel {
         name: "gemm_f16_4x16_scalar",
@@ -126,6 +135,7 @@ pub static GEMM_F: &[GemmKernel] = &[
         nr: 16,
         rows: &[1, 2, 4],
         run: scalar::gemm_f16,
+        windows: scalar::conv_f16,
     },
 ];
 
@@ -144,6 +154,14 @@ impl Kernels {
         let kernel = self.gemm(tile.w.weights());
         // SAFETY: a `Kernels` value only holds rows whose needs are among the detected features; lengths are
         // checked inside, in safe code.
-        unsafe { (kernel.run)(tile) }
+        unsafe { (kernel.run)(tile, ()) }
+    }
+
+    /// Runs one tile on windows in place.
+    #[inline]
+    pub(crate) fn windows(&self, tile: Tile, at: Windows) {
+        let kernel = self.gemm(tile.w.weights());
+        // SAFETY: as above.
+        unsafe { (kernel.windows)(tile, at) }
     }
 }

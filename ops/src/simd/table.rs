@@ -10,11 +10,11 @@ use crate::attention::heads::{KeyPack, QueryPack, ValuePack};
 use crate::attention::softmax::{MergeS8, Rows, SoftmaxTile, WeightsS8};
 use crate::cpu::{Features, Kernels};
 use crate::gemm::pack::RowPack;
-use crate::gemm::s8::tile::{FinishS8, QuadPack};
+use crate::gemm::s8::tile::{FinishS8, QuadPack, WidePack};
 use crate::gemm::tile::Finish;
 use crate::layernorm::NormRow;
 use crate::peak::Width;
-use crate::quantize::QuantizeRow;
+use crate::quantize::{QuantizeRow, ToMap};
 use crate::resize::BilinearRow;
 use crate::rope::RopeRow;
 
@@ -53,12 +53,18 @@ pub struct VectorKernels {
     pub(crate) pack: unsafe fn(RowPack),
     /// `gemm::s8::tile::pack_quads`.
     pub(crate) pack_quads: unsafe fn(QuadPack),
+    /// `gemm::s8::tile::pack_wide`.
+    pub(crate) pack_wide: unsafe fn(WidePack),
     /// `gemm::s8::tile::finish`.
     pub(crate) finish_s8: unsafe fn(FinishS8),
     /// `hadamard::rotate`.
     pub(crate) rotate: unsafe fn(&mut [f32], &[u16], usize),
     /// `quantize::quantize_row`.
     pub(crate) quantize: unsafe fn(QuantizeRow) -> f32,
+    /// `quantize::largest_body`.
+    pub(crate) largest: unsafe fn(&[f32], bool) -> f32,
+    /// `quantize::to_map`.
+    pub(crate) to_map: unsafe fn(ToMap),
     /// `resize::bilinear_row`.
     pub(crate) bilinear: unsafe fn(BilinearRow),
     /// `peak::peak_body`.
@@ -137,6 +143,10 @@ macro_rules! vector_kernels {
                 crate::gemm::s8::tile::pack_quads($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
+            fn pack_wide(rows: crate::gemm::s8::tile::WidePack) {
+                crate::gemm::s8::tile::pack_wide($token::new(), rows);
+            }
+            $(#[target_feature(enable = $features)])?
             fn finish_s8(tile: crate::gemm::s8::tile::FinishS8) {
                 crate::gemm::s8::tile::finish($token::new(), tile);
             }
@@ -147,6 +157,14 @@ macro_rules! vector_kernels {
             $(#[target_feature(enable = $features)])?
             fn quantize(row: crate::quantize::QuantizeRow) -> f32 {
                 crate::quantize::quantize_row($token::new(), row)
+            }
+            $(#[target_feature(enable = $features)])?
+            fn largest(x: &[f32], relu: bool) -> f32 {
+                crate::quantize::largest_body($token::new(), x, relu)
+            }
+            $(#[target_feature(enable = $features)])?
+            fn to_map(pixels: crate::quantize::ToMap) {
+                crate::quantize::to_map($token::new(), pixels);
             }
             $(#[target_feature(enable = $features)])?
             fn bilinear(row: crate::resize::BilinearRow) {
@@ -173,9 +191,12 @@ macro_rules! vector_kernels {
                 finish,
                 pack,
                 pack_quads,
+                pack_wide,
                 finish_s8,
                 rotate,
                 quantize,
+                largest,
+                to_map,
                 bilinear,
                 peak,
             }
@@ -277,6 +298,19 @@ impl Kernels {
     pub(crate) fn quantize(&self, row: QuantizeRow) -> f32 {
         // SAFETY: chosen under the detected features.
         unsafe { (self.vector.quantize)(row) }
+    }
+
+    /// Largest magnitude, NaN when a value is not finite.
+    #[inline]
+    pub(crate) fn largest(&self, x: &[f32], relu: bool) -> f32 {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.largest)(x, relu) }
+    }
+
+    #[inline]
+    pub(crate) fn to_map(&self, pixels: ToMap) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.to_map)(pixels) }
     }
 
     #[inline]

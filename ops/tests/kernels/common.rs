@@ -41,6 +41,7 @@ fn must_run() -> Vec<(bool, &'static str)> {
     vec![
         (has!("avx2"), "vector_avx2"),
         (has!("avx2"), "gemm_s8_4x16_avx2"),
+        (has!("avx2"), "gemm_s8_6x16_avx2wide"),
         (has!("avxvnni"), "gemm_s8_6x16_avxvnni"),
         (has!("avx512bw"), "vector_avx512"),
         (has!("avx512vnni"), "gemm_s8_12x32_avx512vnni"),
@@ -75,7 +76,7 @@ pub(crate) fn kernel_sets() -> Vec<&'static Kernels> {
     });
     assert_eq!(sets[0].isa, Isa::Scalar);
     // The minimum that must run, by what the CPU says of itself.
-    let ran = |name: &str| sets.iter().any(|k| k.vector.name == name || k.gemm_s8.name == name);
+    let ran = |name: &str| sets.iter().any(|k| [k.vector.name, k.gemm_s8.name, k.product_s8.name].contains(&name));
     for (has, name) in must_run() {
         assert!(!has || ran(name), "{name} must run on this CPU");
     }

@@ -39,6 +39,7 @@ unsafe fn dot8(acc: __m256i, (a, magnitude): (__m256i, __m256i), w: __m256i) -> 
 // Every SAFETY line below: the token proves avx2; array references give the bounds, and the loads and stores are
 // unaligned ones.
 impl Dot8 for Avx2 {
+    type Elem = i8;
     type W = [__m256i; 2];
     type A = (__m256i, __m256i);
     type Acc = [__m256i; 2];
@@ -50,14 +51,14 @@ impl Dot8 for Avx2 {
     }
 
     #[inline(always)]
-    fn load(self, x: &[i32; LANES]) -> Self::Acc {
+    fn load(self, _pass: usize, x: &[i32; LANES]) -> Self::Acc {
         let p = x.as_ptr().cast::<__m256i>();
         // SAFETY: the token proves avx2; 64 bytes are readable.
         unsafe { [_mm256_loadu_si256(p), _mm256_loadu_si256(p.add(1))] }
     }
 
     #[inline(always)]
-    fn store(self, acc: Self::Acc, x: &mut [i32; LANES]) {
+    fn store(self, _pass: usize, acc: Self::Acc, x: &mut [i32; LANES]) {
         let p = x.as_mut_ptr().cast::<__m256i>();
         // SAFETY: the token proves avx2; 64 bytes are writable.
         unsafe {
@@ -67,7 +68,7 @@ impl Dot8 for Avx2 {
     }
 
     #[inline(always)]
-    fn load_w(self, x: &[i8; STEP]) -> Self::W {
+    fn load_w(self, _pass: usize, x: &[i8; STEP]) -> Self::W {
         let p = x.as_ptr().cast::<__m256i>();
         // SAFETY: the token proves avx2; 64 bytes are readable.
         unsafe { [_mm256_loadu_si256(p), _mm256_loadu_si256(p.add(1))] }

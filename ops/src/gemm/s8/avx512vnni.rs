@@ -25,6 +25,7 @@ impl Avx512Vnni {
 // Every SAFETY line below: the token proves the features; array references give the bounds, and the loads and
 // stores are unaligned ones.
 impl Dot8 for Avx512Vnni {
+    type Elem = i8;
     type W = __m512i;
     type A = __m512i;
     type Acc = __m512i;
@@ -36,19 +37,19 @@ impl Dot8 for Avx512Vnni {
     }
 
     #[inline(always)]
-    fn load(self, x: &[i32; LANES]) -> __m512i {
+    fn load(self, _pass: usize, x: &[i32; LANES]) -> __m512i {
         // SAFETY: the token proves avx512f; 64 bytes are readable.
         unsafe { _mm512_loadu_si512(x.as_ptr().cast()) }
     }
 
     #[inline(always)]
-    fn store(self, acc: __m512i, x: &mut [i32; LANES]) {
+    fn store(self, _pass: usize, acc: __m512i, x: &mut [i32; LANES]) {
         // SAFETY: the token proves avx512f; 64 bytes are writable.
         unsafe { _mm512_storeu_si512(x.as_mut_ptr().cast(), acc) }
     }
 
     #[inline(always)]
-    fn load_w(self, x: &[i8; STEP]) -> __m512i {
+    fn load_w(self, _pass: usize, x: &[i8; STEP]) -> __m512i {
         // SAFETY: the token proves avx512f; 64 bytes are readable.
         unsafe { _mm512_loadu_si512(x.as_ptr().cast()) }
     }

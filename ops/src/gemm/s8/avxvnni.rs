@@ -25,6 +25,7 @@ impl AvxVnni {
 // Every SAFETY line below: the token proves the features; array references give the bounds, and the loads and
 // stores are unaligned ones.
 impl Dot8 for AvxVnni {
+    type Elem = i8;
     type W = [__m256i; 2];
     type A = __m256i;
     type Acc = [__m256i; 2];
@@ -36,14 +37,14 @@ impl Dot8 for AvxVnni {
     }
 
     #[inline(always)]
-    fn load(self, x: &[i32; LANES]) -> Self::Acc {
+    fn load(self, _pass: usize, x: &[i32; LANES]) -> Self::Acc {
         let p = x.as_ptr().cast::<__m256i>();
         // SAFETY: the token proves avx2; 64 bytes are readable.
         unsafe { [_mm256_loadu_si256(p), _mm256_loadu_si256(p.add(1))] }
     }
 
     #[inline(always)]
-    fn store(self, acc: Self::Acc, x: &mut [i32; LANES]) {
+    fn store(self, _pass: usize, acc: Self::Acc, x: &mut [i32; LANES]) {
         let p = x.as_mut_ptr().cast::<__m256i>();
         // SAFETY: the token proves avx2; 64 bytes are writable.
         unsafe {
@@ -53,7 +54,7 @@ impl Dot8 for AvxVnni {
     }
 
     #[inline(always)]
-    fn load_w(self, x: &[i8; STEP]) -> Self::W {
+    fn load_w(self, _pass: usize, x: &[i8; STEP]) -> Self::W {
         let p = x.as_ptr().cast::<__m256i>();
         // SAFETY: the token proves avx2; 64 bytes are readable.
         unsafe { [_mm256_loadu_si256(p), _mm256_loadu_si256(p.add(1))] }

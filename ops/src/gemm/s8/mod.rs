@@ -9,10 +9,12 @@
 //! | `pack.rs` | K4N16 panels, rows of activations |
 //! | `tile.rs` | the tile over `Dot8`, packing of rows, epilogue |
 //! | `table.rs` | the kernels |
-//! | `scalar.rs` `avx2.rs` `avxvnni.rs` `avx512vnni.rs` `neon.rs` `neondot.rs` | one `Dot8` each |
+//! | `scalar.rs` `avx2.rs` `avx2wide.rs` `avxvnni.rs` `avx512vnni.rs` `neon.rs` `neondot.rs` | one `Dot8` each |
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod avx2wide;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512vnni;
 #[cfg(target_arch = "x86_64")]
@@ -30,20 +32,20 @@ use super::Epilogue;
 use super::pack::{MAX_MR, NR};
 use crate::cpu::Ctx;
 use crate::mat::MatMut;
-use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use pack::{PanelsS8, QUAD, RowsS8, STEP, padded_k};
 use table::{Activations, GemmS8Kernel};
-use tile::{ColumnsS8, FinishS8, MAX_NV, QuadPack, TileS8};
+use tile::{ColumnsS8, FinishS8, MAX_NV, Plus, QuadPack, TileS8, WidePack};
 
-/// Packed activations of one task, in quads: at most 256 KiB, a quarter of a usual second-level cache, so that the
+/// Packed activations of one task, in words of four bytes: at most 256 KiB, a quarter of a usual second-level cache, so that the
 /// panels streaming past do not drive them out.
 const PACKED: usize = 1 << 16;
 /// Most tiles of rows per task. Weights beyond the second-level cache are read once per task: with 5 tiles a product of 868 x
 /// 1024 x 3072 ran at 58 % of the peak, with 8 at 80 % (Zen 4).
 const TILES: usize = 10;
-/// Steps of four inputs between which sums stay in registers: a pair of panels is then 32 KiB.
-const STEPS: usize = 256;
+/// Steps of four inputs between which sums stay in registers, for bytes: a pair of panels is then 32 KiB. Half as many for 16-bit
+/// activations, of which a tile then takes 6 KiB beside 8 KiB of a panel.
+pub(crate) const STEPS: usize = 256;
 /// Tasks wanted, so that a few threads finish together.
 const TASKS: usize = 8;
 /// Fewest panels per task: packing a row again costs as much as the dot products of some 20 of 256 columns.
@@ -53,7 +55,7 @@ const GROUP: usize = 16;
 const LINE: usize = 16;
 
 /// Most f32-sized values of working memory that each thread of the pool keeps after int8 products of up to `k` inputs,
-/// whatever the kernel; for memory plans.
+/// whatever the kernel; for memory plans. (The tallest tile of bytes has 12 rows, of 16-bit activations 6.)
 pub fn working_memory_s8(k: usize) -> usize {
     PACKED.max(MAX_MR * padded_k(k) / QUAD) + TILES * MAX_MR * MAX_NV * NR + LINE
 }
@@ -67,10 +69,23 @@ enum Sink<'a> {
 }
 
 struct Product<'a> {
+    /// Few rows: `kernel` is the one of bytes.
+    few: bool,
     kernel: &'static GemmS8Kernel,
     a: RowsS8<'a>,
     w: PanelsS8<'a>,
     sink: Sink<'a>,
+}
+
+/// Rows up to which products take bytes: widened values pay when many rows share the widened weights. With AVX2, 1024 x 1024, one
+/// thread (Zen 3): 1 row 70 (bytes) against 41 GOP/s, 4 rows 118 and 104, 16 rows 123 and 120, 868 rows 125 and 135.
+const FEW: usize = 16;
+
+impl<'a> Product<'a> {
+    fn new(ctx: Ctx, a: RowsS8<'a>, w: PanelsS8<'a>, sink: Sink<'a>) -> Product<'a> {
+        let few = a.m <= FEW;
+        Product { few, kernel: ctx.kernels.products_s8(few), a, w, sink }
+    }
 }
 
 /// Rows and panels of one task.
@@ -95,8 +110,10 @@ fn product(ctx: Ctx, p: &Product) {
     }
     let steps = padded_k(p.w.k) / QUAD;
     let (mr, nv) = (p.kernel.mr, p.kernel.nr / NR);
+    // Words of a packed row.
+    let words = steps * p.kernel.bytes;
     let row_tiles = m.div_ceil(mr);
-    let most = (PACKED / (mr * steps.max(1))).clamp(1, TILES);
+    let most = (PACKED / (mr * words.max(1))).clamp(1, TILES);
     // Even shares of the rows; four or a multiple, so that two or four threads finish together.
     let row_tasks = row_tiles.div_ceil(most).next_multiple_of(4).min(row_tiles);
     // Whole groups of the kernel's panels.
@@ -104,7 +121,7 @@ fn product(ctx: Ctx, p: &Product) {
     let col_tasks = TASKS.div_ceil(row_tasks).clamp(1, (groups * nv).div_ceil(GROUP));
     let block = row_tiles.div_ceil(row_tasks) * mr;
 
-    let used = block * (steps + nv * NR);
+    let used = block * (words + nv * NR);
     let scratch = used + LINE;
     assert!(scratch <= working_memory_s8(p.w.k), "{scratch} values of working memory for {} inputs", p.w.k);
     ctx.pool.reserve_scratch(scratch);
@@ -117,7 +134,6 @@ fn product(ctx: Ctx, p: &Product) {
             // Sums first and on a cache line: a vector across two lines costs two accesses.
             let skip = memory.as_ptr().align_offset(LINE * size_of::<f32>()).min(LINE);
             let (acc, packed) = memory[skip..][..used].split_at_mut(block * nv * NR);
-            let packed: &mut [u32] = bytemuck::cast_slice_mut(packed);
             let acc: &mut [i32] = bytemuck::cast_slice_mut(acc);
             pack_block(ctx, p, first..first + rows, packed);
             for g in columns {
@@ -130,9 +146,9 @@ fn product(ctx: Ctx, p: &Product) {
 }
 
 /// Rows of a task to tiles `[tile][step][row]`.
-fn pack_block(ctx: Ctx, p: &Product, rows: std::ops::Range<usize>, packed: &mut [u32]) {
+fn pack_block(ctx: Ctx, p: &Product, rows: std::ops::Range<usize>, packed: &mut [f32]) {
     let width = padded_k(p.w.k);
-    let steps = width / QUAD;
+    let words = width / QUAD * p.kernel.bytes;
     let flip = match p.kernel.activations {
         Activations::Signed => 0,
         Activations::Offset128 => 0x8080_8080,
@@ -143,43 +159,48 @@ fn pack_block(ctx: Ctx, p: &Product, rows: std::ops::Range<usize>, packed: &mut 
         for (i, row) in from.iter_mut().enumerate().take(here) {
             *row = &p.a.data[(rows.start + r + i) * width..][..width];
         }
-        let width = p.kernel.fit(here);
-        ctx.kernels.pack_quads(QuadPack { from, steps, width, flip, out: &mut packed[r * steps..] });
+        let (steps, width) = (width / QUAD, p.kernel.fit(here));
+        let out = &mut packed[r * words..][..p.kernel.mr * words];
+        if p.kernel.bytes == 1 {
+            ctx.kernels.pack_quads(QuadPack { from, steps, width, flip, out: bytemuck::cast_slice_mut(out) });
+        } else {
+            ctx.kernels.pack_wide(WidePack { from, steps, width, out: bytemuck::cast_slice_mut(out) });
+        }
     }
 }
 
-/// One group of panels over the rows of a task.
-fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[u32], &mut [i32])) {
-    let steps = padded_k(p.w.k) / QUAD;
-    let mr = p.kernel.mr;
-    let packed: &[i8] = bytemuck::cast_slice(packed);
-    let mut columns = ColumnsS8::default();
+/// Where the sums of a group of panels start.
+pub(crate) fn starts(kernel: &GemmS8Kernel, w: PanelsS8, panel: usize, panels: usize) -> [[i32; NR]; MAX_NV] {
     let mut start = [[0i32; NR]; MAX_NV];
-    let ep = match &p.sink {
-        Sink::Sums(_) => Epilogue::default(),
-        Sink::Values { ep, .. } => *ep,
-    };
-    for v in 0..part.panels {
-        let col = (part.panel + v) * NR;
-        let cols = NR.min(p.w.n - col);
-        columns.scales[v][..cols].copy_from_slice(&p.w.scales[col..col + cols]);
-        if let Some(bias) = ep.bias {
-            columns.bias[v][..cols].copy_from_slice(&bias[col..col + cols]);
-        }
-        if let Some(gamma) = ep.gamma {
-            columns.gamma[v][..cols].copy_from_slice(&gamma[col..col + cols]);
-        }
-        if p.kernel.activations == Activations::Offset128 {
-            for (s, sum) in start[v].iter_mut().zip(&p.w.col_sums[col..col + cols]) {
+    if kernel.activations == Activations::Offset128 {
+        for (v, start) in start.iter_mut().enumerate().take(panels) {
+            let col = (panel + v) * NR;
+            for (s, sum) in start.iter_mut().zip(&w.col_sums[col..w.n.min(col + NR)]) {
                 *s = -128 * sum;
             }
         }
     }
+    start
+}
+
+/// One group of panels over the rows of a task.
+fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &mut [i32])) {
+    let steps = padded_k(p.w.k) / QUAD;
+    let mr = p.kernel.mr;
+    let packed: &[i8] = bytemuck::cast_slice(packed);
+    let ep = match &p.sink {
+        Sink::Sums(_) => Epilogue::default(),
+        Sink::Values { ep, .. } => *ep,
+    };
+    let columns = ColumnsS8::of(p.w, (part.panel, part.panels), ep.bias, ep.gamma);
+    let start = starts(p.kernel, p.w, part.panel, part.panels);
     let w = &p.w.data[part.panel * steps * STEP..];
     let size = mr * NR * part.panels;
+    let block = STEPS / p.kernel.bytes;
+    let quad = QUAD * p.kernel.bytes;
     let mut s0 = 0;
     loop {
-        let here = STEPS.min(steps - s0);
+        let here = block.min(steps - s0);
         let last = s0 + here == steps;
         for (tile, r) in (0..part.rows).step_by(mr).enumerate() {
             let rows = mr.min(part.rows - r);
@@ -188,17 +209,18 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[u32], &m
             if last && let Sink::Values { out, stride, .. } = &p.sink {
                 out.prefetch((part.first + r) * stride + part.panel * NR, part.panels * NR, *stride, rows);
             }
-            ctx.kernels.tile_s8(TileS8 {
+            let one = TileS8 {
                 rows: width,
                 panels: part.panels,
                 steps: here,
-                a: &packed[(r * steps + s0 * width) * QUAD..][..here * width * QUAD],
+                a: &packed[(r * steps + s0 * width) * quad..][..here * width * quad],
                 w: &w[s0 * STEP..],
                 w_stride: steps * STEP,
                 start: if s0 == 0 { Some(&start) } else { None },
-                acc,
+                acc: &mut *acc,
                 acc_stride: mr * NR,
-            });
+            };
+            ctx.kernels.product_tile_s8(p.few, one);
             if last {
                 finish_tile(ctx, p, Part { first: part.first + r, rows, ..part }, (&columns, acc));
             }
@@ -236,7 +258,8 @@ fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &
                 columns,
                 act: ep.act,
                 gamma: ep.gamma.is_some(),
-                residual: ep.residual,
+                plus: if ep.residual { Plus::Output } else { Plus::Nothing },
+                relu_sum: false,
                 out,
                 at: part.first * stride + col,
                 stride: *stride,
@@ -261,15 +284,13 @@ pub fn gemm_s8(ctx: Ctx, a: RowsS8, w: PanelsS8, ep: Epilogue, out: MatMut) {
         assert!(v.is_none_or(|v| v.len() == w.n), "{what} of {} outputs", w.n);
     }
     let stride = out.stride;
-    let (macs, bytes) = (a.m * w.n * w.k, (a.m + w.n) * w.k + 4 * a.m * w.n);
-    let _span = opclock::span(Op::GemmS8, || Work { macs: macs as u64, bytes: bytes as u64 });
     let sink = Sink::Values { ep, out: SharedMut::new(out.data), stride };
-    product(ctx, &Product { kernel: ctx.kernels.gemm_s8, a, w, sink });
+    product(ctx, &Product::new(ctx, a, w, sink));
 }
 
 /// The exact sums of [`gemm_s8`], `[m, n]`: what every kernel must agree on.
 pub fn gemm_s8_sums(ctx: Ctx, a: RowsS8, w: PanelsS8, out: &mut [i32]) {
     let (a, w) = checked(a, w);
     assert_eq!(out.len(), a.m * w.n, "outputs of an int8 product");
-    product(ctx, &Product { kernel: ctx.kernels.gemm_s8, a, w, sink: Sink::Sums(SharedMut::new(out)) });
+    product(ctx, &Product::new(ctx, a, w, Sink::Sums(SharedMut::new(out))));
 }

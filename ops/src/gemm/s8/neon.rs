@@ -99,6 +99,7 @@ pub(super) unsafe fn store_sums(acc: [int32x4_t; 4], p: *mut i32) {
 
 // Every SAFETY line below: the token proves neon; array references give the bounds.
 impl Dot8 for Neon {
+    type Elem = i8;
     type W = [int8x16_t; 4];
     type A = int8x16_t;
     type Acc = [int32x4_t; 4];
@@ -110,19 +111,19 @@ impl Dot8 for Neon {
     }
 
     #[inline(always)]
-    fn load(self, x: &[i32; LANES]) -> Self::Acc {
+    fn load(self, _pass: usize, x: &[i32; LANES]) -> Self::Acc {
         // SAFETY: the token proves neon; 16 values are readable.
         unsafe { load_sums(x.as_ptr()) }
     }
 
     #[inline(always)]
-    fn store(self, acc: Self::Acc, x: &mut [i32; LANES]) {
+    fn store(self, _pass: usize, acc: Self::Acc, x: &mut [i32; LANES]) {
         // SAFETY: the token proves neon; 16 values are writable.
         unsafe { store_sums(acc, x.as_mut_ptr()) }
     }
 
     #[inline(always)]
-    fn load_w(self, x: &[i8; STEP]) -> Self::W {
+    fn load_w(self, _pass: usize, x: &[i8; STEP]) -> Self::W {
         // SAFETY: the token proves neon; 64 bytes are readable.
         unsafe { load_bytes(x.as_ptr()) }
     }

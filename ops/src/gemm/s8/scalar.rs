@@ -17,6 +17,7 @@ impl Scalar {
 }
 
 impl Dot8 for Scalar {
+    type Elem = i8;
     type W = [i8; STEP];
     type A = [i8; QUAD];
     type Acc = [i32; LANES];
@@ -27,17 +28,17 @@ impl Dot8 for Scalar {
     }
 
     #[inline(always)]
-    fn load(self, x: &[i32; LANES]) -> [i32; LANES] {
+    fn load(self, _pass: usize, x: &[i32; LANES]) -> [i32; LANES] {
         *x
     }
 
     #[inline(always)]
-    fn store(self, acc: [i32; LANES], x: &mut [i32; LANES]) {
+    fn store(self, _pass: usize, acc: [i32; LANES], x: &mut [i32; LANES]) {
         *x = acc;
     }
 
     #[inline(always)]
-    fn load_w(self, x: &[i8; STEP]) -> [i8; STEP] {
+    fn load_w(self, _pass: usize, x: &[i8; STEP]) -> [i8; STEP] {
         *x
     }
 

@@ -2,12 +2,14 @@
 #![allow(unsafe_code)]
 
 use super::scalar;
-use super::tile::{FinishS8, QuadPack, TileS8};
+use super::tile::{FinishS8, QuadPack, TileS8, WidePack};
 #[cfg(target_arch = "x86_64")]
-use super::{avx2, avx512vnni, avxvnni};
+use super::{avx2, avx2wide, avx512vnni, avxvnni};
 #[cfg(target_arch = "aarch64")]
 use super::{neon, neondot};
 use crate::cpu::{Features, Kernels};
+use crate::gemm::tile::Windows;
+use crate::quantize::MapOut;
 
 /// How a kernel takes the bytes of activations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,7 +35,11 @@ pub struct GemmS8Kernel {
     pub rows: &'static [usize],
     /// How it takes activations.
     pub activations: Activations,
-    pub(crate) run: unsafe fn(TileS8),
+    /// Bytes that an activation takes in its memory: 1, or 2 where values are widened beforehand.
+    pub bytes: usize,
+    pub(crate) run: unsafe fn(TileS8, ()),
+    /// The tile on windows in place.
+    pub(crate) windows: unsafe fn(TileS8, Windows),
     pub(crate) peak: unsafe fn(i32) -> i32,
 }
 
@@ -41,6 +47,15 @@ impl GemmS8Kernel {
     /// Smallest row count it can run that holds `rows` (`rows <= mr`).
     pub(crate) fn fit(&self, rows: usize) -> usize {
         *self.rows.iter().find(|&&r| r >= rows).expect("at most mr rows")
+    }
+
+    /// Working memory as a map of pixels to be filled.
+    pub(crate) fn map<'a>(&self, memory: &'a mut [f32]) -> MapOut<'a> {
+        match (self.bytes, self.activations) {
+            (1, Activations::Signed) => MapOut::Bytes(bytemuck::cast_slice_mut(memory), 0),
+            (1, Activations::Offset128) => MapOut::Bytes(bytemuck::cast_slice_mut(memory), 0x80),
+            _ => MapOut::Wide(bytemuck::cast_slice_mut(memory)),
+        }
     }
 }
 
@@ -54,7 +69,9 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         nr: 32,
         rows: &[1, 2, 4, 6, 8, 10, 12],
         activations: Activations::Offset128,
+        bytes: 1,
         run: avx512vnni::gemm_s8,
+        windows: avx512vnni::conv_s8,
         peak: avx512vnni::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -65,8 +82,23 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         activations: Activations::Offset128,
+        bytes: 1,
         run: avxvnni::gemm_s8,
+        windows: avxvnni::conv_s8,
         peak: avxvnni::peak_s8,
+    },
+    #[cfg(target_arch = "x86_64")]
+    GemmS8Kernel {
+        name: "gemm_s8_6x16_avx2wide",
+        needs: Features::AVX2,
+        mr: 6,
+        nr: 16,
+        rows: &[1, 2, 3, 4, 5, 6],
+        activations: Activations::Signed,
+        bytes: 2,
+        run: avx2wide::gemm_s8,
+        windows: avx2wide::conv_s8,
+        peak: avx2wide::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
     GemmS8Kernel {
@@ -76,7 +108,9 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4],
         activations: Activations::Signed,
+        bytes: 1,
         run: avx2::gemm_s8,
+        windows: avx2::conv_s8,
         peak: avx2::peak_s8,
     },
     #[cfg(target_arch = "aarch64")]
@@ -87,7 +121,9 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4, 5, 6],
         activations: Activations::Signed,
+        bytes: 1,
         run: neondot::gemm_s8,
+        windows: neondot::conv_s8,
         peak: neondot::peak_s8,
     },
     #[cfg(target_arch = "aarch64")]
@@ -98,7 +134,9 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         nr: 16,
         rows: &[1, 2, 3, 4],
         activations: Activations::Signed,
+        bytes: 1,
         run: neon::gemm_s8,
+        windows: neon::conv_s8,
         peak: neon::peak_s8,
     },
     GemmS8Kernel {
@@ -108,7 +146,9 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         nr: 16,
         rows: &[1, 2, 4],
         activations: Activations::Signed,
+        bytes: 1,
         run: scalar::gemm_s8,
+        windows: scalar::conv_s8,
         peak: scalar::peak_s8,
     },
 ];
@@ -116,24 +156,50 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
 // A `Kernels` value only holds rows whose needs are among the detected features: the SAFETY argument of every call
 // below. Lengths are checked inside, in safe code.
 impl Kernels {
-    /// Runs one tile.
+    /// Runs one tile of `gemm_s8`.
     #[inline]
     pub(crate) fn tile_s8(&self, tile: TileS8) {
         // SAFETY: chosen under the detected features.
-        unsafe { (self.gemm_s8.run)(tile) }
+        unsafe { (self.gemm_s8.run)(tile, ()) }
     }
 
-    /// The peak probe of the int8 kernel.
+    /// Runs one tile of `product_s8`, or of `gemm_s8` with `few` rows.
+    #[inline]
+    pub(crate) fn product_tile_s8(&self, few: bool, tile: TileS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.products_s8(few).run)(tile, ()) }
+    }
+
+    /// The row for products: `product_s8`, or `gemm_s8` with `few` rows.
+    #[inline]
+    pub(crate) fn products_s8(&self, few: bool) -> &'static GemmS8Kernel {
+        if few { self.gemm_s8 } else { self.product_s8 }
+    }
+
+    /// Runs one tile of `product_s8` on windows in place.
+    #[inline]
+    pub(crate) fn windows_s8(&self, tile: TileS8, at: Windows) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.product_s8.windows)(tile, at) }
+    }
+
+    /// The peak probe of `product_s8`.
     #[inline]
     pub(crate) fn peak_s8(&self, seed: i32) -> i32 {
         // SAFETY: chosen under the detected features.
-        unsafe { (self.gemm_s8.peak)(seed) }
+        unsafe { (self.product_s8.peak)(seed) }
     }
 
     #[inline]
     pub(crate) fn pack_quads(&self, rows: QuadPack) {
         // SAFETY: chosen under the detected features.
         unsafe { (self.vector.pack_quads)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn pack_wide(&self, rows: WidePack) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.pack_wide)(rows) }
     }
 
     #[inline]

@@ -1,37 +1,47 @@
 //! The int8 tile: acc[r][n] += sum over k of a[r][k] * w[n][k], exact in i32.
 //!
-//! Operands are packed: `a` holds for each four inputs the tile's rows, four bytes each; `w` is read in place from the
-//! panels. Written once over [`Dot8`]; every instruction set instantiates it. Sums are exact, so neither the order nor
-//! the blocking can show.
+//! `w` is read in place from the panels. Rows of activations come in one of two ways: packed (for each four inputs the tile's
+//! rows side by side), or as windows of a quantized map, read in place. Written once over [`Dot8`]; every instruction set
+//! instantiates it. Sums are exact, so neither the order nor the blocking can show.
 
-use super::pack::{QUAD, STEP};
+use super::pack::{PanelsS8, QUAD, STEP};
 use crate::activation::{gelu_lanes, relu_lanes};
 use crate::gemm::Act;
 use crate::gemm::pack::MAX_MR;
+use crate::gemm::tile::Windows;
 use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector};
 
 /// Panels of the widest kernel.
 pub(crate) const MAX_NV: usize = 2;
 
-/// Token of an instruction set's byte dot product over sixteen outputs.
+/// An activation in memory.
+pub(crate) trait Elem: bytemuck::Pod + Default {}
+impl Elem for i8 {}
+impl Elem for i16 {}
+
+/// Token of an instruction set's dot product of four inputs over sixteen outputs.
 pub(crate) trait Dot8: Copy {
-    /// Sixteen outputs of four weights.
+    /// An activation in memory.
+    type Elem: Elem;
+    /// Four weights of the outputs of one pass.
     type W: Copy;
     /// One row's four activations, in every output.
     type A: Copy;
-    /// Sixteen i32 sums.
+    /// The i32 sums of the outputs of one pass.
     type Acc: Copy;
+    /// Passes over a panel: 1, or 2 of eight outputs each where sixteen would need too many registers.
+    const PASSES: usize = 1;
     /// Sums of zero.
     fn zero(self) -> Self::Acc;
-    /// Sums from memory.
-    fn load(self, x: &[i32; LANES]) -> Self::Acc;
-    /// Sums to memory.
-    fn store(self, acc: Self::Acc, x: &mut [i32; LANES]);
-    /// One step of a panel.
-    fn load_w(self, x: &[i8; STEP]) -> Self::W;
+    /// Sums of a pass from memory.
+    fn load(self, pass: usize, x: &[i32; LANES]) -> Self::Acc;
+    /// Sums of a pass to memory.
+    fn store(self, pass: usize, acc: Self::Acc, x: &mut [i32; LANES]);
+    /// One step of a panel, the outputs of a pass.
+    fn load_w(self, pass: usize, x: &[i8; STEP]) -> Self::W;
     /// One row's activations, in the form that the instruction wants.
-    fn prep_a(self, quad: &[i8; QUAD]) -> Self::A;
+    fn prep_a(self, quad: &[Self::Elem; QUAD]) -> Self::A;
     /// acc + the four products of each output.
     fn dot(self, acc: Self::Acc, a: Self::A, w: Self::W) -> Self::Acc;
     /// One step of the whole tile. An instruction set that takes several rows from one register has its own.
@@ -39,7 +49,7 @@ pub(crate) trait Dot8: Copy {
     fn step<const MR: usize, const NV: usize>(
         self,
         acc: &mut [[Self::Acc; NV]; MR],
-        rows: &[[i8; QUAD]; MR],
+        rows: &[[Self::Elem; QUAD]; MR],
         w: &[Self::W; NV],
     ) {
         for r in 0..MR {
@@ -51,15 +61,15 @@ pub(crate) trait Dot8: Copy {
     }
 }
 
-/// One step of a product.
+/// One block of steps of a tile.
 pub(crate) struct TileS8<'a> {
     /// Rows, one of the kernel's counts.
     pub rows: usize,
     /// Panels, up to the kernel's nr / 16.
     pub panels: usize,
-    /// Steps of four inputs.
+    /// Steps of four inputs (of each line, where rows are windows).
     pub steps: usize,
-    /// `[step][rows][4]`.
+    /// `[step][rows][4]`, or the map from the first window on: the bytes of the kernel's values.
     pub a: &'a [i8],
     /// First panel at its first step.
     pub w: &'a [i8],
@@ -73,77 +83,130 @@ pub(crate) struct TileS8<'a> {
     pub acc_stride: usize,
 }
 
-/// The tile with `MR` rows and `NV` panels; all sums stay in registers.
+/// Sums of a tile in registers: from `start`, or from where the last block left them.
 #[inline(always)]
-pub(crate) fn body<D: Dot8, const MR: usize, const NV: usize>(d: D, t: TileS8) {
-    let steps = t.steps;
-    let a = &t.a.as_chunks::<QUAD>().0.as_chunks::<MR>().0[..steps];
-    let mut panels: [&[[i8; STEP]]; NV] = [&[]; NV];
+fn begin<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, t: &TileS8) -> [[D::Acc; NV]; MR] {
     let mut acc = [[d.zero(); NV]; MR];
     for v in 0..NV {
-        panels[v] = &t.w[v * t.w_stride..].as_chunks::<STEP>().0[..steps];
         let sums = &t.acc[v * t.acc_stride..][..MR * LANES].as_chunks::<LANES>().0[..MR];
         for r in 0..MR {
-            acc[r][v] = d.load(t.start.map_or(&sums[r], |start| &start[v]));
+            acc[r][v] = d.load(pass, t.start.map_or(&sums[r], |start| &start[v]));
         }
     }
-    for i in 0..steps {
-        let mut w = [d.load_w(&panels[0][i]); NV];
-        for v in 1..NV {
-            w[v] = d.load_w(&panels[v][i]);
-        }
-        d.step(&mut acc, &a[i], &w);
-    }
+    acc
+}
+
+/// Sums of a tile to memory.
+#[inline(always)]
+fn end<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, acc: &[[D::Acc; NV]; MR], t: &mut TileS8) {
     for v in 0..NV {
         let sums = &mut t.acc[v * t.acc_stride..][..MR * LANES].as_chunks_mut::<LANES>().0[..MR];
         for r in 0..MR {
-            d.store(acc[r][v], &mut sums[r]);
+            d.store(pass, acc[r][v], &mut sums[r]);
         }
+    }
+}
+
+/// The tile of packed rows with `MR` rows and `NV` panels; all sums of a pass stay in registers.
+#[inline(always)]
+pub(crate) fn packed<D: Dot8, const MR: usize, const NV: usize>(d: D, mut t: TileS8, (): ()) {
+    let steps = t.steps;
+    let a: &[D::Elem] = bytemuck::cast_slice(t.a);
+    let a = &a.as_chunks::<QUAD>().0.as_chunks::<MR>().0[..steps];
+    for pass in 0..D::PASSES {
+        let mut acc = begin::<D, MR, NV>(d, pass, &t);
+        let mut panels: [&[[i8; STEP]]; NV] = [&[]; NV];
+        for v in 0..NV {
+            panels[v] = &t.w[v * t.w_stride..].as_chunks::<STEP>().0[..steps];
+        }
+        for i in 0..steps {
+            let mut w = [d.load_w(pass, &panels[0][i]); NV];
+            for v in 1..NV {
+                w[v] = d.load_w(pass, &panels[v][i]);
+            }
+            d.step(&mut acc, &a[i], &w);
+        }
+        end(d, pass, &acc, &mut t);
+    }
+}
+
+/// The tile whose rows are windows of a map, read in place: line after line of the window, each one run of neighbours.
+#[inline(always)]
+pub(crate) fn windows<D: Dot8, const MR: usize, const NV: usize>(d: D, mut t: TileS8, at: Windows) {
+    let Windows { lines, line, pixel } = at;
+    let run = t.steps;
+    let a: &[D::Elem] = bytemuck::cast_slice(t.a);
+    for pass in 0..D::PASSES {
+        let mut acc = begin::<D, MR, NV>(d, pass, &t);
+        for l in 0..lines {
+            let mut rows: [&[[D::Elem; QUAD]]; MR] = [&[]; MR];
+            for r in 0..MR {
+                rows[r] = &a[l * line + r * pixel..].as_chunks::<QUAD>().0[..run];
+            }
+            let mut panels: [&[[i8; STEP]]; NV] = [&[]; NV];
+            for v in 0..NV {
+                panels[v] = &t.w[v * t.w_stride + l * run * STEP..].as_chunks::<STEP>().0[..run];
+            }
+            for i in 0..run {
+                let mut w = [d.load_w(pass, &panels[0][i]); NV];
+                for v in 1..NV {
+                    w[v] = d.load_w(pass, &panels[v][i]);
+                }
+                let mut quads = [rows[0][i]; MR];
+                for r in 1..MR {
+                    quads[r] = rows[r][i];
+                }
+                d.step(&mut acc, &quads, &w);
+            }
+        }
+        end(d, pass, &acc, &mut t);
     }
 }
 
 /// Steps of the peak probe between two looks at the clock.
 pub(crate) const PEAK_STEPS: usize = 1 << 12;
-/// The full tile with weights that stay in registers. Activations are read anew at each step, so that no part of a
-/// composed dot product leaves the loop.
+/// The full tile on operands in the first-level cache. Both are read anew at each step, so that no part of a composed dot
+/// product leaves the loop.
 #[inline(always)]
 pub(crate) fn peak_body<D: Dot8, const MR: usize, const NV: usize>(d: D, seed: i32) -> i32 {
     let mut sums = [[[seed; LANES]; NV]; MR];
-    let mut acc = [[d.zero(); NV]; MR];
-    let mut w = [d.load_w(&[1; STEP]); NV];
+    let mut weights = [[1i8; STEP]; NV];
     for v in 0..NV {
-        w[v] = d.load_w(&[(v as i8) + (seed as i8 | 1); STEP]);
+        weights[v] = [(v as i8) + (seed as i8 | 1); STEP];
         for r in 0..MR {
             sums[r][v][0] = (r * NV + v) as i32;
-            acc[r][v] = d.load(&sums[r][v]);
         }
     }
-    let mut rows = [[1i8, 2, 3, 4]; MR];
-    for (r, quad) in rows.iter_mut().enumerate() {
-        quad[0] = r as i8;
-    }
-    for _ in 0..PEAK_STEPS {
-        d.step(&mut acc, std::hint::black_box(&rows), &w);
-    }
-    for r in 0..MR {
-        for v in 0..NV {
-            d.store(acc[r][v], &mut sums[r][v]);
+    let rows = [[D::Elem::default(); QUAD]; MR];
+    for pass in 0..D::PASSES {
+        let mut acc = [[d.zero(); NV]; MR];
+        for r in 0..MR {
+            for v in 0..NV {
+                acc[r][v] = d.load(pass, &sums[r][v]);
+            }
+        }
+        for _ in 0..PEAK_STEPS {
+            let weights = std::hint::black_box(&weights);
+            let mut w = [d.load_w(pass, &weights[0]); NV];
+            for v in 1..NV {
+                w[v] = d.load_w(pass, &weights[v]);
+            }
+            d.step(&mut acc, std::hint::black_box(&rows), &w);
+        }
+        for r in 0..MR {
+            for v in 0..NV {
+                d.store(pass, acc[r][v], &mut sums[r][v]);
+            }
         }
     }
     sums.as_flattened().as_flattened().iter().fold(0, |x, y| x ^ y)
 }
 
-/// `gemm_s8` and `peak_s8` of one instruction set: one body per row count and panel count.
+/// `gemm_s8`, `conv_s8` and `peak_s8` of one instruction set: one body per row count and panel count.
 macro_rules! gemm_s8_entries {
-    ($token:ident, rows $rows:tt, panels [$($panels:literal),*], full $mr:literal x $nv:literal $(, $features:literal)?) => {
-        /// Tile.
-        $(#[target_feature(enable = $features)])?
-        pub(crate) fn gemm_s8(t: crate::gemm::s8::tile::TileS8) {
-            match t.panels {
-                $($panels => crate::gemm::s8::tile::s8_by_rows!($token, t, $panels, $rows),)*
-                other => panic!("a tile of {other} panels"),
-            }
-        }
+    ($token:ident, rows $rows:tt, panels $panels:tt, full $mr:literal x $nv:literal $(, $features:literal)?) => {
+        crate::gemm::s8::tile::s8_entry!(gemm_s8, packed, (), $token, $rows, $panels $(, $features)?);
+        crate::gemm::s8::tile::s8_entry!(conv_s8, windows, crate::gemm::tile::Windows, $token, $rows, $panels $(, $features)?);
 
         /// Peak probe.
         $(#[target_feature(enable = $features)])?
@@ -154,15 +217,36 @@ macro_rules! gemm_s8_entries {
 }
 pub(crate) use gemm_s8_entries;
 
+macro_rules! s8_entry {
+    ($name:ident, $body:ident, $places:ty, $token:ident, $rows:tt, [$($panels:literal),*] $(, $features:literal)?) => {
+        /// Tile of the rows in its name.
+        $(#[target_feature(enable = $features)])?
+        pub(crate) fn $name(t: crate::gemm::s8::tile::TileS8, at: $places) {
+            match t.panels {
+                $($panels => crate::gemm::s8::tile::s8_by_rows!($body, ($token::new(), t, at), $panels, t.rows, $rows),)*
+                other => panic!("a tile of {other} panels"),
+            }
+        }
+    };
+}
+pub(crate) use s8_entry;
+
 macro_rules! s8_by_rows {
-    ($token:ident, $t:ident, $panels:literal, [$($rows:literal),*]) => {
-        match $t.rows {
-            $($rows => crate::gemm::s8::tile::body::<_, $rows, $panels>($token::new(), $t),)*
+    ($body:ident, $arguments:tt, $panels:literal, $count:expr, [$($rows:literal),*]) => {
+        match $count {
+            $($rows => crate::gemm::s8::tile::s8_call!($body, $rows, $panels, $arguments),)*
             other => panic!("a tile of {other} rows"),
         }
     };
 }
 pub(crate) use s8_by_rows;
+
+macro_rules! s8_call {
+    ($body:ident, $rows:literal, $panels:literal, ($d:expr, $t:ident, $at:ident)) => {
+        crate::gemm::s8::tile::$body::<_, $rows, $panels>($d, $t, $at)
+    };
+}
+pub(crate) use s8_call;
 
 /// Rows of int8 activations to be packed for a tile: `out[step][r] = from[r][4 step..][..4] ^ flip`.
 pub(crate) struct QuadPack<'a> {
@@ -178,10 +262,70 @@ pub(crate) struct QuadPack<'a> {
     pub out: &'a mut [u32],
 }
 
-/// Packs rows in blocks of 16 x 16 quads, transposed in registers (a quad moves like the bits of one f32).
+/// Rows of int8 activations to be packed for a tile of 16-bit activations: `out[step][r] = from[r][4 step..][..4]`.
+pub(crate) struct WidePack<'a> {
+    /// At least `4 * steps` values each; an empty row is zeros.
+    pub from: [&'a [i8]; MAX_MR],
+    /// Steps of four values.
+    pub steps: usize,
+    /// Rows of the tile.
+    pub width: usize,
+    /// `[steps][width]`.
+    pub out: &'a mut [[i16; QUAD]],
+}
+
+/// Packs rows of bytes.
 #[inline(always)]
 pub(crate) fn pack_quads<S: Simd>(s: S, t: QuadPack) {
-    let QuadPack { from, steps, width, flip, out } = t;
+    transposed(s, &t.from, (t.steps, t.width), t.out, t.flip);
+}
+
+/// Packs rows of bytes as 16-bit values.
+#[inline(always)]
+pub(crate) fn pack_wide<S: Simd>(s: S, t: WidePack) {
+    transposed(s, &t.from, (t.steps, t.width), t.out, 0);
+}
+
+/// A packed quad. Functions, not closures: those lose the instruction set where they are not inlined.
+trait Quad: Copy {
+    /// Of sixteen quads of bytes.
+    fn of(quads: &[f32; LANES], flip: u32) -> [Self; LANES];
+}
+
+impl Quad for u32 {
+    #[inline(always)]
+    fn of(quads: &[f32; LANES], flip: u32) -> [u32; LANES] {
+        let mut out = [0; LANES];
+        for i in 0..LANES {
+            out[i] = quads[i].to_bits() ^ flip;
+        }
+        out
+    }
+}
+
+impl Quad for [i16; QUAD] {
+    #[inline(always)]
+    fn of(quads: &[f32; LANES], _flip: u32) -> [[i16; QUAD]; LANES] {
+        let bytes: &[[i8; QUAD]; LANES] = bytemuck::cast_ref(quads);
+        let mut out = [[0; QUAD]; LANES];
+        for i in 0..LANES {
+            for j in 0..QUAD {
+                out[i][j] = i16::from(bytes[i][j]);
+            }
+        }
+        out
+    }
+}
+
+/// Rows to quads in blocks of 16 x 16, transposed in registers (a quad moves like the bits of one f32).
+#[inline(always)]
+fn transposed<S: Simd, Q: Quad>(
+    s: S,
+    from: &[&[i8]; MAX_MR],
+    (steps, width): (usize, usize),
+    out: &mut [Q],
+    flip: u32,
+) {
     let out = &mut out[..steps * width];
     let mut q0 = 0;
     while q0 < steps {
@@ -193,21 +337,31 @@ pub(crate) fn pack_quads<S: Simd>(s: S, t: QuadPack) {
             }
             let row = &from[r][q0 * QUAD..(q0 + len) * QUAD];
             for (b, quad) in block[r].iter_mut().zip(row.as_chunks::<QUAD>().0) {
-                *b = f32::from_bits(u32::from_ne_bytes(quad.map(|v| v as u8)) ^ flip);
+                *b = f32::from_bits(u32::from_ne_bytes(quad.map(|v| v as u8)));
             }
         }
         s.transpose(&mut block);
         for (i, lanes) in block[..len].iter().enumerate() {
             let at = (q0 + i) * width;
-            let lanes = lanes.map(f32::to_bits);
+            let quads = Q::of(lanes, flip);
             // Sixteen at once where there is room: what runs over is written again by the next step.
             match out[at..].first_chunk_mut::<LANES>() {
-                Some(to) => *to = lanes,
-                None => out[at..at + width].copy_from_slice(&lanes[..width]),
+                Some(to) => *to = quads,
+                None => out[at..at + width].copy_from_slice(&quads[..width]),
             }
         }
         q0 += len;
     }
+}
+
+/// What is added to an output when it is stored.
+#[derive(Clone, Copy)]
+pub(crate) enum Plus<'a> {
+    Nothing,
+    /// What the output holds.
+    Output,
+    /// The value at the same place of another matrix of the output's shape.
+    Other(&'a [f32]),
 }
 
 /// The epilogue of one tile of sums.
@@ -226,8 +380,10 @@ pub(crate) struct FinishS8<'a> {
     pub act: Act,
     /// Whether `columns.gamma` applies.
     pub gamma: bool,
-    /// Whether to add to what the output holds.
-    pub residual: bool,
+    /// What is added.
+    pub plus: Plus<'a>,
+    /// Whether the output is rectified after that.
+    pub relu_sum: bool,
     /// The whole output.
     pub out: &'a SharedMut<'a, f32>,
     /// Place of the tile's first value in it.
@@ -244,6 +400,41 @@ pub(crate) struct ColumnsS8 {
     pub scales: [[f32; LANES]; MAX_NV],
     pub bias: [[f32; LANES]; MAX_NV],
     pub gamma: [[f32; LANES]; MAX_NV],
+}
+
+impl ColumnsS8 {
+    /// Of `panels` panels from `panel` on; the bias repeats over the outputs with its length as period.
+    pub(crate) fn of(
+        w: PanelsS8,
+        (panel, panels): (usize, usize),
+        bias: Option<&[f32]>,
+        gamma: Option<&[f32]>,
+    ) -> ColumnsS8 {
+        let mut columns = ColumnsS8::default();
+        for v in 0..panels {
+            let col = (panel + v) * LANES;
+            let cols = LANES.min(w.n - col);
+            columns.scales[v][..cols].copy_from_slice(&w.scales[col..col + cols]);
+            if let Some(bias) = bias {
+                for (i, b) in columns.bias[v][..cols].iter_mut().enumerate() {
+                    *b = bias[(col + i) % bias.len()];
+                }
+            }
+            if let Some(gamma) = gamma {
+                columns.gamma[v][..cols].copy_from_slice(&gamma[col..col + cols]);
+            }
+        }
+        columns
+    }
+
+    /// Without the first `panels` panels.
+    pub(crate) fn from(&self, panels: usize) -> ColumnsS8 {
+        let mut columns = *self;
+        columns.scales.rotate_left(panels);
+        columns.bias.rotate_left(panels);
+        columns.gamma.rotate_left(panels);
+        columns
+    }
 }
 
 /// y = act(fma(acc, row scale * output scale, bias)) * gamma; out = out + y or y. Every step rounds once.
@@ -270,22 +461,34 @@ pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
             // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
             #[allow(unsafe_code)]
             let out = unsafe { t.out.slice(at..at + cols) };
+            let mut lanes = [0.0; LANES];
+            match t.plus {
+                Plus::Nothing => {}
+                Plus::Output => y = load_some(s, out, &mut lanes) + y,
+                Plus::Other(x) => y = load_some(s, &x[at..at + cols], &mut lanes) + y,
+            }
+            if t.relu_sum {
+                y = relu_lanes(s, y);
+            }
             match out.first_chunk_mut::<LANES>() {
-                Some(out) => {
-                    if t.residual {
-                        y = s.load(out) + y;
-                    }
-                    y.store(out);
-                }
+                Some(out) => y.store(out),
                 None => {
-                    let mut lanes = crate::simd::padded(out, 0.0);
-                    if t.residual {
-                        y = s.load(&lanes) + y;
-                    }
                     y.store(&mut lanes);
                     out.copy_from_slice(&lanes[..out.len()]);
                 }
             }
+        }
+    }
+}
+
+/// Up to sixteen values, zeros beyond.
+#[inline(always)]
+fn load_some<S: Simd>(s: S, x: &[f32], lanes: &mut [f32; LANES]) -> S::V {
+    match x.first_chunk::<LANES>() {
+        Some(x) => s.load(x),
+        None => {
+            lanes[..x.len()].copy_from_slice(x);
+            s.load(lanes)
         }
     }
 }
