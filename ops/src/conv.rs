@@ -1,15 +1,18 @@
 //! Convolution and transposed convolution through the matrix panels.
 //!
 //! Images are channels-last. A convolution is a matrix product whose row for output pixel (y, x) is the
-//! input window in the order `[ky][kx][in]`; windows are gathered while the rows are packed for the tile, so
-//! no column buffer exists. A transposed convolution with stride = kernel is one product whose
-//! outputs `[ky][kx][out]` are scattered while they are stored.
+//! input window in the order `[ky][kx][in]`. Windows that overlap are read in place from a padded map of a band of lines
+//! (`conv_map.rs`); others are gathered while the rows are packed for the tile. No column buffer exists in either case. A
+//! transposed convolution with stride = kernel is one product whose outputs `[ky][kx][out]` are scattered while they are stored.
 
+use crate::conv_map::{Shape, Step, TILES, sweep};
 use crate::cpu::{Ctx, Kernels};
 use crate::gemm::pack::{Change, MAX_MR, RowPack};
-use crate::gemm::{Act, AddTo, NR, Panels, Product, RowSink, Rows, Sink, Source, product};
+use crate::gemm::tile::{Finish, Tile};
+use crate::gemm::{
+    Act, AddTo, KC, MAX_NV, NR, PanelData, Panels, Product, RowSink, Rows, Sink, Source, per_column, product,
+};
 use crate::mat::{Hwc, HwcMut};
-use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 
 /// A convolution layer.
@@ -73,6 +76,120 @@ pub fn conv_transpose_rows(weight: &[f32], inp: usize, out: usize, kernel: usize
     rows
 }
 
+/// Values of the map of a band: 512 KiB.
+const BUDGET: usize = 1 << 17;
+/// Fewest lines of a band.
+const FEWEST: usize = 2;
+
+fn shape((h, w, c): (usize, usize, usize), kernel: usize, stride: usize, pad: usize) -> Shape {
+    let (oh, ow) = (conv_out(h, kernel, stride, pad), conv_out(w, kernel, stride, pad));
+    Shape { h, w, c, kernel, stride, pad, oh, ow }
+}
+
+/// Most f32 values of working memory that each thread of the pool keeps after [`conv2d`] with windows that overlap, `x` being (height,
+/// width, channels) of the input, whatever the kernel; for memory plans. Up to 512 KiB of map (more only where two lines of output
+/// need more) beside some 20 KiB. For other windows see [`crate::gemm::working_memory`].
+pub fn working_memory_conv(x: (usize, usize, usize), kernel: usize, stride: usize, pad: usize) -> usize {
+    let shape = shape(x, kernel, stride, pad);
+    if shape.oh * shape.ow == 0 { 0 } else { shape.map(shape.band(BUDGET, FEWEST)) + TILES * MAX_MR * MAX_NV * NR }
+}
+
+/// Convolution whose windows overlap: bands of a padded map, windows in place.
+fn overlapping(ctx: Ctx, x: Hwc, conv: &Conv, sink: &RowSink) {
+    let weight = conv.weight;
+    let shape = shape((x.h, x.w, x.c), conv.kernel, conv.stride, conv.pad);
+    if shape.oh * shape.ow * weight.n == 0 {
+        return;
+    }
+    let kernel = ctx.kernels.gemm(weight.data.weights());
+    let band = shape.band(BUDGET, FEWEST);
+    let scratch = shape.map(band) + TILES * kernel.mr * kernel.nr;
+    let most = working_memory_conv((x.h, x.w, x.c), conv.kernel, conv.stride, conv.pad);
+    assert!(scratch <= most, "{scratch} values of working memory, {most} announced");
+    ctx.pool.reserve_scratch(scratch);
+    ctx.pool.run(shape.oh.div_ceil(band), &|task, worker| {
+        let rows = task * band..((task + 1) * band).min(shape.oh);
+        ctx.pool.with_scratch(worker, scratch, |memory| {
+            let (acc, map) = memory.split_at_mut(TILES * kernel.mr * kernel.nr);
+            fill(ctx, x, &shape, conv.relu_input == Act::Relu, rows.start, &mut map[..shape.map(rows.len())]);
+            multiply(ctx, conv, &shape, rows, (map, acc), sink);
+        });
+    });
+}
+
+/// The input lines under a band to its map, zeros around.
+fn fill(ctx: Ctx, x: Hwc, shape: &Shape, relu: bool, first: usize, map: &mut [f32]) {
+    let (side, inside) = (shape.pad * shape.c, shape.w * shape.c);
+    for (j, line) in map.chunks_mut(shape.line()).enumerate() {
+        match shape.source(first, j) {
+            // What is behind the last line is read but not used.
+            Some(y) if line.len() == shape.line() => {
+                line[..side].fill(0.0);
+                line[side..][..inside].copy_from_slice(&x.data[y * inside..][..inside]);
+                line[side + inside..].fill(0.0);
+            }
+            _ => line.fill(0.0),
+        }
+    }
+    if relu {
+        ctx.kernels.map(crate::activation::Map::Relu, map);
+    }
+}
+
+/// Every output of a band.
+fn multiply(
+    ctx: Ctx,
+    conv: &Conv,
+    shape: &Shape,
+    rows: std::ops::Range<usize>,
+    (map, acc): (&[f32], &mut [f32]),
+    sink: &RowSink,
+) {
+    let Panels { n, k, data } = conv.weight;
+    let kernel = ctx.kernels.gemm(data.weights());
+    let (mr, nv) = (kernel.mr, kernel.nr / NR);
+    for panel in (0..n.div_ceil(NR)).step_by(nv) {
+        let panels = nv.min(n.div_ceil(NR) - panel);
+        let bias = per_column(conv.bias, panel, n);
+        sweep(shape, rows.clone(), mr, KC, |step: Step| {
+            let acc = &mut acc[step.tile * mr * kernel.nr..][..mr * NR * panels];
+            if step.start {
+                acc.fill(0.0);
+            }
+            let at = (panel * k + step.k) * NR;
+            let tile = Tile {
+                rows: kernel.fit(step.pixels),
+                panels,
+                k: step.run,
+                a: &map[step.at..],
+                w: match data {
+                    PanelData::F32(d) => PanelData::F32(&d[at..]),
+                    PanelData::F16(d) => PanelData::F16(&d[at..]),
+                },
+                w_stride: k * NR,
+                acc: &mut *acc,
+                acc_stride: mr * NR,
+            };
+            ctx.kernels.windows(tile, step.windows);
+            if let Some(row) = step.done {
+                ctx.kernels.finish(Finish {
+                    acc: &mut *acc,
+                    acc_stride: mr * NR,
+                    rows: step.pixels,
+                    bias: conv.bias.map(|_| &bias[..]),
+                    act: conv.act,
+                    gamma: None,
+                    panels,
+                });
+                for v in 0..panels {
+                    let col = (panel + v) * NR;
+                    sink.put(row, col, NR.min(n - col), &acc[v * mr * NR..][..step.pixels * NR]);
+                }
+            }
+        });
+    }
+}
+
 /// Rows of a product that are windows of an image.
 struct Windows<'a> {
     x: Hwc<'a>,
@@ -124,21 +241,23 @@ pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut)
         assert_eq!((r.h, r.w, r.c), (oh, ow, weight.n), "residual of a convolution");
     }
     let add = residual.map_or(AddTo::Nothing, |r| AddTo::Other(r.as_mat()));
-    let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
     let sink = RowSink { out: SharedMut::new(out.data), stride: weight.n, add };
+    if kernel > stride {
+        return overlapping(ctx, x, conv, &sink);
+    }
+    let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
     let (bias, act) = (conv.bias, conv.act);
-    let _span = opclock::span(Op::Conv, || Work::product(oh * ow, &weight, x.h * x.w * x.c));
     product(ctx, &Product { m: oh * ow, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }
 
 /// Outputs `[ky][kx][out]` of input pixel (y, x) go to pixels (y k + ky, x k + kx).
-struct Scatter<'a> {
-    out: SharedMut<'a, f32>,
+pub(crate) struct Scatter<'a> {
+    pub out: SharedMut<'a, f32>,
     /// Input width.
-    w: usize,
-    kernel: usize,
+    pub w: usize,
+    pub kernel: usize,
     /// Outputs of one line of the kernel: kernel * out.
-    line: usize,
+    pub line: usize,
 }
 
 impl Sink for Scatter<'_> {
@@ -171,7 +290,6 @@ pub fn conv_transpose(ctx: Ctx, x: Hwc, conv: &ConvTranspose, out: HwcMut) {
     assert!(bias.is_none_or(|b| b.len() == out.c), "bias of {} outputs", out.c);
     let (m, act) = (x.h * x.w, Act::None);
     let source = Rows(x.as_mat());
-    let _span = opclock::span(Op::Conv, || Work::product(m, &weight, m * x.c));
     let sink = Scatter { w: x.w, kernel, line: kernel * out.c, out: SharedMut::new(out.data) };
     product(ctx, &Product { m, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }

@@ -386,6 +386,60 @@ pub fn conv2d(x: Hwc, weight: &[f32], bias: Option<&[f32]>, window: Window) -> V
     out
 }
 
+/// Convolution in integers, with the input scales of [`crate::conv_s8`]: `weight` `[out, in, kernel, kernel]` -> (sums `[oh, ow, out]`, the input
+/// scale of each output pixel `[oh, ow]`). With `relu` the input is rectified first.
+pub fn conv2d_s8(x: Hwc, weight: &[i8], window: Window, relu: bool) -> (Vec<i32>, Vec<f32>) {
+    let Window { kernel, stride, pad } = window;
+    let n = weight.len() / (x.c * kernel * kernel);
+    assert_eq!(weight.len(), n * x.c * kernel * kernel, "weights of {} channels, {kernel} x {kernel}", x.c);
+    let oh = crate::conv::conv_out(x.h, kernel, stride, pad);
+    let ow = crate::conv::conv_out(x.w, kernel, stride, pad);
+    let band = crate::conv_s8::band_lines((x.h, x.w, x.c), kernel, stride, pad);
+    let lines = |first: usize, count: usize| {
+        let from = (first * stride).saturating_sub(pad).min(x.h);
+        let to = ((first + count - 1) * stride + kernel).saturating_sub(pad).min(x.h);
+        from..to.max(from)
+    };
+    let (mut sums, mut scales) = (Vec::new(), Vec::new());
+    for oy in 0..oh {
+        for ox in 0..ow {
+            // Pixels that share a scale: all of the lines under the band, or the window's.
+            let (ys, xs) = if kernel > stride {
+                let first = oy / band * band;
+                (lines(first, band.min(oh - first)), 0..x.w)
+            } else {
+                let from = (ox * stride).saturating_sub(pad).min(x.w);
+                (lines(oy, 1), from..(ox * stride + kernel).saturating_sub(pad).clamp(from, x.w))
+            };
+            let mut values = Vec::new();
+            for y in ys.clone() {
+                for xx in xs.clone() {
+                    values.extend(x.pixel(y, xx).iter().map(|&v| if relu { self::relu(v) } else { v }));
+                }
+            }
+            let (q, scale) = quantize(&values);
+            scales.push(scale);
+            for o in 0..n {
+                let mut sum = 0;
+                for t in 0..kernel * kernel {
+                    let (y, xx) =
+                        ((oy * stride + t / kernel).wrapping_sub(pad), (ox * stride + t % kernel).wrapping_sub(pad));
+                    if !ys.contains(&y) || !xs.contains(&xx) {
+                        continue;
+                    }
+                    let at = ((y - ys.start) * xs.len() + xx - xs.start) * x.c;
+                    for i in 0..x.c {
+                        let w = weight[(o * x.c + i) * kernel * kernel + t];
+                        sum += i32::from(q[at + i]) * i32::from(w);
+                    }
+                }
+                sums.push(sum);
+            }
+        }
+    }
+    (sums, scales)
+}
+
 /// Transposed convolution with stride = kernel: `weight` `[in, out, kernel, kernel]` ->
 /// `[h * kernel, w * kernel, out]`.
 pub fn conv_transpose(x: Hwc, weight: &[f32], bias: Option<&[f32]>, kernel: usize) -> Vec<f32> {

@@ -2,6 +2,7 @@
 
 use sf_ops::attention::{FrameMask, Heads, attention, attention_s8, scratch_len, scratch_len_s8};
 use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
+use sf_ops::conv_s8::{ConvS8, conv2d_s8};
 use sf_ops::gemm::{
     Act, Epilogue, Panels, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, pack_f32, panel_len, panel_len_s8,
 };
@@ -63,6 +64,18 @@ fn the_second_run_allocates_nothing() {
     let up = ConvTranspose { weight: Panels::f32(&panels[..panel_len(c, c)], c, c), bias: None, kernel: 2 };
     let (mut bytes, mut scales) = (vec![0i8; rows * c], vec![0.0; rows]);
     let (bytes_w, sums) = (vec![3i8; panel_len_s8(c, c)], vec![3 * c as i32; c]);
+    let conv_w = vec![3i8; panel_len_s8(c, 9 * c)];
+    let conv_sums = vec![27 * c as i32; c];
+    let conv_s8 = ConvS8 {
+        weight: PanelsS8 { n: c, k: 9 * c, data: &conv_w, scales: &x[..c], col_sums: &conv_sums },
+        bias: None,
+        kernel: 3,
+        stride: 1,
+        pad: 1,
+        relu_input: Act::Relu,
+        act: Act::None,
+        relu_sum: false,
+    };
     let signs = vec![0x5a5a; c / 16];
     let mut round = || {
         let a = Mat::new(&x[..rows * c], rows, c);
@@ -82,6 +95,7 @@ fn the_second_run_allocates_nothing() {
         let w = PanelsS8 { n: c, k: c, data: &bytes_w, scales: &x[..c], col_sums: &sums };
         gemm_s8(ctx, quantized, w, ep, MatMut::new(&mut y, rows, c));
         conv2d(ctx, image, &conv, None, HwcMut::new(&mut y, 10, 14, c));
+        conv2d_s8(ctx, image, &conv_s8, None, HwcMut::new(&mut y, 10, 14, c));
         conv_transpose(ctx, image, &up, HwcMut::new(&mut big[..rows * c], 20, 28, c / 4));
         bilinear(ctx, image, Corners::Aligned, HwcMut::new(&mut big, 20, 28, c));
     };

@@ -2,11 +2,10 @@
 //! specification 1.3, step 8). No layer scale, no q/k norms.
 
 use crate::arena::{carve, carved_len};
-use crate::block::{self, BlockShape, Sight};
+use crate::block::{self, BlockShape, Net, Sight};
 use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::Decoder;
-use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
 use sf_formats::Result;
@@ -16,7 +15,8 @@ use sf_ops::mat::{Mat, MatMut};
 /// Tokens, block scratch.
 fn lens(decoder: &Decoder, d: &Dims, tokens: usize, threads: usize) -> [usize; 2] {
     let mask = d.frame_mask(tokens);
-    [d.frames * tokens * decoder.projects.weight.n, BlockShape::most(&decoder.blocks, &mask, threads)]
+    let blocks = decoder.blocks.iter().map(|b| BlockShape::of(b, threads).scratch_len(&mask)).max();
+    [d.frames * tokens * decoder.projects.weight.n, blocks.unwrap_or(0)]
 }
 
 /// Values of working memory of [`run`].

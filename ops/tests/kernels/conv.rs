@@ -16,7 +16,8 @@ fn close(y: &[f32], expected: &[f32], k: usize, what: &str) {
 fn convolutions() {
     let windows = [(1, 1, 0), (3, 1, 1), (3, 2, 1), (3, 1, 0), (7, 1, 3), (2, 2, 0), (14, 14, 0), (5, 3, 4)];
     for (i, (kernel, stride, pad)) in windows.into_iter().enumerate() {
-        for (h, w, c, n) in [(14, 28, 3, 20), (5, 6, 17, 33), (15, 14, 4, 1), (1, 1, 2, 16)] {
+        // The last: several bands, and windows in blocks of parts of a line.
+        for (h, w, c, n) in [(14, 28, 3, 20), (5, 6, 17, 33), (15, 14, 4, 1), (1, 1, 2, 16), (21, 5, 130, 35)] {
             let (oh, ow) = (conv_out(h, kernel, stride, pad), conv_out(w, kernel, stride, pad));
             let mut r = Random::new((i * 1000 + h * 10 + c) as u64);
             let (x, weight, bias) = (r.vec(h * w * c), r.vec(n * c * kernel * kernel), r.vec(n));

@@ -4,6 +4,7 @@
 use crate::common::{Random, everywhere};
 use sf_ops::attention::{FrameMask, Heads, attention, attention_s8, scratch_len, scratch_len_s8};
 use sf_ops::conv::{Conv, ConvTranspose, conv_transpose, conv2d};
+use sf_ops::conv_s8::{ConvS8, ConvTransposeS8, conv_rows_s8, conv_transpose_s8, conv2d_s8};
 use sf_ops::gemm::{
     Act, Epilogue, Panels, PanelsS8, RowsS8, RowsS8Mut, col_sums, gemm, gemm_s8, pack_f16, pack_f32, pack_s8, padded_k,
     panel_len, panel_len_s8,
@@ -127,6 +128,41 @@ fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
         h.values(&y);
     });
 
+    add("conv_s8", &mut |h| {
+        let image: Vec<f32> = (0..21 * 17 * 10).map(|i| ((i * 6151 % 4093) as f32 - 2046.0) * 0.0007).collect();
+        for (kernel, stride, pad, oh, ow) in [(3, 1, 1, 21, 17), (3, 2, 1, 11, 9), (1, 1, 0, 21, 17)] {
+            let k = kernel * kernel * 12;
+            let (n, rows) = (19, conv_rows_s8(&bytes[..19 * kernel * kernel * 10], 19, 10, kernel));
+            let mut panels = vec![0; panel_len_s8(n, k)];
+            pack_s8(&rows, n, k, &mut panels);
+            let sums = col_sums(&panels, n, k);
+            let conv = ConvS8 {
+                weight: PanelsS8 { n, k, data: &panels, scales: &step[..n], col_sums: &sums },
+                bias: Some(&bias[..n]),
+                kernel,
+                stride,
+                pad,
+                relu_input: Act::Relu,
+                act: Act::None,
+                relu_sum: true,
+            };
+            let before = vec![0.25; oh * ow * n];
+            let mut y = vec![0.0; oh * ow * n];
+            let out = HwcMut::new(&mut y, oh, ow, n);
+            conv2d_s8(ctx, Hwc::new(&image, 21, 17, 10), &conv, Some(Hwc::new(&before, oh, ow, n)), out);
+            h.values(&y);
+        }
+        let (n, k) = (28, 10);
+        let mut panels = vec![0; panel_len_s8(n, k)];
+        pack_s8(&bytes[..n * k], n, k, &mut panels);
+        let sums = col_sums(&panels, n, k);
+        let weight = PanelsS8 { n, k, data: &panels, scales: &step[..n], col_sums: &sums };
+        let conv = ConvTransposeS8 { weight, bias: Some(&bias[..7]), kernel: 2 };
+        let mut y = vec![0.0; 42 * 34 * 7];
+        conv_transpose_s8(ctx, Hwc::new(&image, 21, 17, 10), &conv, HwcMut::new(&mut y, 42, 34, 7));
+        h.values(&y);
+    });
+
     let image = r.vec(9 * 11 * 5);
     let kernel = r.vec(19 * 45);
     let mut panels = vec![0.0; panel_len(19, 45)];
@@ -186,13 +222,14 @@ fn run(ctx: Ctx) -> Vec<(&'static str, u64)> {
 
 #[test]
 fn one_hash_on_every_architecture() {
-    let expected: [(&str, u64); 11] = [
+    let expected: [(&str, u64); 12] = [
         ("gemm", 0x3b38_01f7_f874_0f00),
         ("layernorm", 0x8906_f5da_73ab_4ea7),
         ("rope", 0xa9fc_176d_24de_7e1c),
         ("attention", 0x60ab_c85b_fb17_8428),
         ("attention_s8", 0x5416_126b_410f_512a),
         ("int8", 0x2470_8ce5_2820_2599),
+        ("conv_s8", 0x49b2_2e37_12e3_48cb),
         ("conv2d", 0x5dd3_78aa_c81e_9282),
         ("conv_transpose", 0xe266_fa32_c915_87fd),
         ("bilinear", 0x3aeb_e860_cceb_c040),

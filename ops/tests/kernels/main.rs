@@ -5,6 +5,7 @@ mod attention;
 mod attention_s8;
 mod common;
 mod conv;
+mod conv_s8;
 mod gemm;
 mod gemm_s8;
 mod hash;
