@@ -10,6 +10,7 @@ use sf_formats::clip::{Clip, ClipOptions, MixedSizes, Orientation};
 use sf_formats::{Dtype, Error, LoadMode};
 use sf_ops::Kernels;
 use sf_ops::cpu::Isa;
+pub(crate) use sf_quant::names::glob;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -80,6 +81,8 @@ pub(crate) enum Precision {
     F32,
     /// 16-bit floats, computed in 32 bits
     F16,
+    /// 8-bit integers; sensitive layers stay floats
+    Int8,
 }
 
 impl Precision {
@@ -88,6 +91,7 @@ impl Precision {
         match self {
             Precision::F32 => Dtype::F32,
             Precision::F16 => Dtype::F16,
+            Precision::Int8 => Dtype::Int8,
         }
     }
 }
@@ -228,35 +232,6 @@ impl FromStr for Shift {
         }
         Ok(shift)
     }
-}
-
-/// Whether a name matches a pattern of literal text, `*` (any run) and `?` (any one byte).
-pub(crate) fn glob(pattern: &str, name: &str) -> bool {
-    let (p, n) = (pattern.as_bytes(), name.as_bytes());
-    let (mut i, mut j) = (0, 0);
-    // Position of the last star and of the name when it was met: where to go on after a mismatch.
-    let mut star: Option<(usize, usize)> = None;
-    while j < n.len() {
-        match p.get(i) {
-            Some(b'*') => {
-                star = Some((i, j));
-                i += 1;
-            }
-            Some(&c) if c == b'?' || c == n[j] => {
-                i += 1;
-                j += 1;
-            }
-            _ => match star {
-                Some((s, at)) => {
-                    star = Some((s, at + 1));
-                    i = s + 1;
-                    j = at + 1;
-                }
-                None => return false,
-            },
-        }
-    }
-    p[i..].iter().all(|&c| c == b'*')
 }
 
 /// Whether a path's name ends in an extension, in any case.

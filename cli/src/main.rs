@@ -11,6 +11,9 @@
 //! | `model.rs` | the model of a verb: blob, checkpoint, or random weights |
 //! | `reconstruct.rs` | clip and model to network output |
 //! | `results.rs` | network output to files |
+//! | `golden.rs` | the golden run of a blob |
+//! | `scan.rs` | which layers int8 is too coarse for |
+//! | `versus.rs` | one model against another: `compare` and the checks of `convert` |
 //! | `views.rs` | cameras for `render`: along the clip, fixed, in orbit, displaced |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
@@ -19,14 +22,17 @@
 mod args;
 mod exit;
 mod folder;
+mod golden;
 mod model;
 mod network;
 mod output;
 mod progress;
 mod reconstruct;
 mod results;
+mod scan;
 mod signals;
 mod verbs;
+mod versus;
 mod views;
 
 use clap::Parser;

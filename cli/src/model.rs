@@ -97,9 +97,17 @@ fn from_checkpoint(path: &Path, to: Precision, console: &Console) -> Result<Blob
 }
 
 /// A private temporary folder, deleted when dropped.
-struct Scratch(PathBuf);
+pub(crate) struct Scratch(PathBuf);
 
-fn scratch_folder() -> Result<Scratch> {
+impl Scratch {
+    /// Where it is.
+    pub(crate) fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+/// A new one, under the system's temporary folder.
+pub(crate) fn scratch_folder() -> Result<Scratch> {
     use std::os::unix::fs::DirBuilderExt;
     let pid = std::process::id();
     // The name need not be secret: making the folder fails when somebody else made it first.

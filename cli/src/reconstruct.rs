@@ -9,7 +9,7 @@ use sf_formats::digest::{Digest, sha256};
 use sf_formats::{Intrinsics, ModelConfig, Result};
 use std::sync::Arc;
 use streetforward::preprocess::{DEFAULT_PIXELS, fit_size, prepare};
-use streetforward::{ClipShape, FrameSource, Options, Output, Prepared, Session, SourceFrame};
+use streetforward::{ClipShape, FrameSource, Model, Options, Output, Prepared, Session, SourceFrame};
 
 /// The frames that the protocol gives to the model.
 pub(crate) fn context_clip(clip: &Clip, protocol: &Protocol) -> Clip {
@@ -54,11 +54,16 @@ pub(crate) fn prepare_clip(
 
 /// A session for clips of one shape.
 pub(crate) fn session(loaded: &Loaded, shape: ClipShape, engine: &EngineArgs) -> Result<Session> {
+    session_of(&loaded.model, shape, engine)
+}
+
+/// A session of a model for clips of one shape.
+pub(crate) fn session_of(model: &Arc<Model>, shape: ClipShape, engine: &EngineArgs) -> Result<Session> {
     let mut options = Options { threads: crate::args::threads(engine.threads), isa: engine.isa, ..Options::default() };
     if let Some(bytes) = engine.max_mem {
         options.max_bytes = bytes;
     }
-    Session::new(Arc::clone(&loaded.model), shape, options)
+    Session::new(Arc::clone(model), shape, options)
 }
 
 /// Names and sizes of a clip's pictures, for a scene.

@@ -5,8 +5,9 @@
 //! permuting the frames permutes the result. After a pair whose features a head reads, its two
 //! outputs are kept side by side: `[frames * tokens, 2 dim]`, frame features left for frame-first order.
 
-use crate::block::{self, Net, Sight};
+use crate::block::{self, Sight};
 use crate::embed;
+use crate::net::Net;
 use crate::plan::Plan;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
@@ -14,6 +15,7 @@ use sf_formats::Result;
 use sf_formats::config::{ModelConfig, Order};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Mat, MatMut};
+use sf_ops::opclock::{self, Op, Work};
 
 /// Runs all layers in place on `x` `[frames * tokens, dim]` and fills `pairs` (see [`Pairs`](crate::features::Pairs)).
 ///
@@ -55,6 +57,7 @@ pub(crate) fn run(
         probe.layer(format_args!("aa.{i}"), x)?;
         probe.emit(format_args!("aa.{i}"), None, &[d.frames, d.tokens, dim], x);
         if let Some(slot) = plan.pairs.iter().position(|&p| p == i / 2) {
+            let _span = opclock::span(Op::Glue, || Work::values(x.len()));
             let pair = &mut pairs[slot * rows * 2 * dim..][..rows * 2 * dim];
             for (wide, token) in pair.chunks_exact_mut(2 * dim).zip(x.chunks_exact(dim)) {
                 wide[(i % 2) * dim..][..dim].copy_from_slice(token);

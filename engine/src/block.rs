@@ -5,41 +5,16 @@
 //! x += ls2 * fc2(gelu(fc1(norm2 x)))
 //! ```
 //!
-//! Optional parts (q/k norms, layer scale, rotary embedding) are absent where the weights or the caller
+//! In blocks whose q|k|v and output projections are int8, attention is int8, too. Optional parts (q/k norms, layer scale, rotary embedding) are absent where the weights or the caller
 //! have none. x is `[rows, dim]`, dense, rows = frames * tokens of the mask.
 
 use crate::arena::{carve, carved_len};
-use crate::model::{Block, Linear, Model, Norm};
-use sf_ops::attention::{self, FrameMask};
-use sf_ops::cpu::Ctx;
-use sf_ops::gemm::{Act, Epilogue, gemm};
+use crate::model::Block;
+use crate::net::Net;
+use sf_ops::attention::{self, FrameMask, Heads};
+use sf_ops::gemm::Act;
 use sf_ops::mat::{Mat, MatMut};
 use sf_ops::rope::{QkNorm, RopeTable, qk_norm_rope};
-
-/// Weights and the machine to run them on.
-#[derive(Clone, Copy)]
-pub(crate) struct Net<'a> {
-    pub(crate) ctx: Ctx<'a>,
-    pub(crate) model: &'a Model,
-}
-
-impl<'a> Net<'a> {
-    /// out = act(x W^T + b).
-    pub(crate) fn linear(&self, l: &Linear, act: Act, x: Mat, out: MatMut) {
-        let bias = l.bias.map(|b| self.model.values(b));
-        gemm(self.ctx, x, self.model.panels(&l.weight), Epilogue { bias, act, ..Epilogue::default() }, out);
-    }
-
-    /// out += gamma * act(x W^T + b).
-    pub(crate) fn linear_onto(&self, l: &Linear, act: Act, gamma: Option<&[f32]>, x: Mat, out: MatMut) {
-        let bias = l.bias.map(|b| self.model.values(b));
-        gemm(self.ctx, x, self.model.panels(&l.weight), Epilogue { bias, act, gamma, residual: true }, out);
-    }
-
-    pub(crate) fn norm(&self, n: &Norm, x: Mat, out: MatMut) {
-        sf_ops::layernorm::layernorm(self.ctx, x, self.model.values(n.gain), self.model.values(n.offset), n.eps, out);
-    }
-}
 
 /// Sizes that decide the working memory of a block.
 #[derive(Clone, Copy, Debug)]
@@ -47,12 +22,23 @@ pub(crate) struct BlockShape {
     pub(crate) dim: usize,
     pub(crate) heads: usize,
     pub(crate) hidden: usize,
+    /// Whether attention is int8.
+    pub(crate) attention_s8: bool,
+    /// Whether normed tokens exist as floats: int8 layers take them quantized in the same pass.
+    pub(crate) normed: bool,
     pub(crate) threads: usize,
 }
 
 impl BlockShape {
     pub(crate) fn of(block: &Block, threads: usize) -> BlockShape {
-        BlockShape { dim: block.dim, heads: block.heads, hidden: block.hidden, threads }
+        let normed = !(block.qkv.weight.is_int8() && block.fc1.weight.is_int8());
+        let attention_s8 = block.int8_attention();
+        BlockShape { dim: block.dim, heads: block.heads, hidden: block.hidden, attention_s8, normed, threads }
+    }
+
+    /// Most working memory of [`forward`] with any of the blocks.
+    pub(crate) fn most(blocks: &[Block], mask: &FrameMask, threads: usize) -> usize {
+        blocks.iter().map(|b| BlockShape::of(b, threads).scratch_len(mask)).max().unwrap_or(0)
     }
 
     /// Normed tokens, then one area that is first q|k|v and the mixed values, later the MLP's hidden
@@ -60,8 +46,9 @@ impl BlockShape {
     fn lens(&self, mask: &FrameMask) -> [usize; 3] {
         let rows = mask.frames * mask.tokens;
         let wide = carved_len(self.attention_lens(rows)).max(rows * self.hidden);
-        let scratch = attention::scratch_len(mask, self.heads, self.dim / self.heads, self.threads);
-        [rows * self.dim, wide, scratch]
+        let len = if self.attention_s8 { attention::scratch_len_s8 } else { attention::scratch_len };
+        let scratch = len(mask, self.heads, self.dim / self.heads, self.threads);
+        [if self.normed { rows * self.dim } else { 0 }, wide, scratch]
     }
 
     fn attention_lens(&self, rows: usize) -> [usize; 2] {
@@ -89,35 +76,38 @@ pub(crate) fn forward(net: Net, block: &Block, x: &mut [f32], sight: Sight, scra
     {
         let [qkv, mixed] = carve(wide, shape.attention_lens(rows));
         project(net, block, Mat::new(x, rows, dim), sight.rope, normed, qkv);
-        attend(net, block, qkv, sight.mask, Attend { x, mixed, heads });
+        attend(net, block, qkv, sight, Attend { x, mixed, heads });
     }
     mlp(net, block, x, rows, normed, wide);
 }
 
 /// [`forward`] from a q|k|v that was computed before: two passes over the same input share it.
-pub(crate) fn forward_from(net: Net, block: &Block, qkv: &[f32], x: &mut [f32], mask: FrameMask, scratch: &mut [f32]) {
-    let rows = mask.frames * mask.tokens;
+pub(crate) fn forward_from(net: Net, block: &Block, qkv: &[f32], x: &mut [f32], sight: Sight, scratch: &mut [f32]) {
+    let rows = sight.mask.frames * sight.mask.tokens;
     let shape = BlockShape::of(block, net.ctx.pool.threads());
-    let [normed, wide, heads] = carve(scratch, shape.lens(&mask));
-    attend(net, block, qkv, mask, Attend { x, mixed: &mut wide[..rows * block.dim], heads });
+    let [normed, wide, heads] = carve(scratch, shape.lens(&sight.mask));
+    attend(net, block, qkv, sight, Attend { x, mixed: &mut wide[..rows * block.dim], heads });
     mlp(net, block, x, rows, normed, wide);
 }
 
-/// q|k|v of x, `[rows, 3 dim]`, normed and rotated.
+/// q|k|v of x, `[rows, 3 dim]`, normed and with positions unless attention is int8, which does that itself. `normed` is working memory as large as x, or none for an int8 layer.
 pub(crate) fn project(net: Net, block: &Block, x: Mat, rope: Option<&RopeTable>, normed: &mut [f32], qkv: &mut [f32]) {
     let (rows, dim) = (x.rows, block.dim);
-    net.norm(&block.norm1, x, MatMut::new(normed, rows, dim));
-    net.linear(&block.qkv, Act::None, Mat::new(normed, rows, dim), MatMut::new(qkv, rows, 3 * dim));
-    let norm = block.qk.as_ref().map(|(q, k)| QkNorm {
+    net.normed_linear(&block.norm1, &block.qkv, Act::None, (x, normed), MatMut::new(qkv, rows, 3 * dim));
+    let norm = head_norm(net, block);
+    if !block.int8_attention() && (norm.is_some() || rope.is_some()) {
+        qk_norm_rope(net.ctx, MatMut::new(qkv, rows, 3 * dim), block.heads, norm, rope);
+    }
+}
+
+fn head_norm<'a>(net: Net<'a>, block: &Block) -> Option<QkNorm<'a>> {
+    block.qk.as_ref().map(|(q, k)| QkNorm {
         q_gain: net.model.values(q.gain),
         q_offset: net.model.values(q.offset),
         k_gain: net.model.values(k.gain),
         k_offset: net.model.values(k.offset),
         eps: q.eps,
-    });
-    if norm.is_some() || rope.is_some() {
-        qk_norm_rope(net.ctx, MatMut::new(qkv, rows, 3 * dim), block.heads, norm, rope);
-    }
+    })
 }
 
 struct Attend<'a> {
@@ -127,20 +117,25 @@ struct Attend<'a> {
 }
 
 /// x += ls1 * proj(attention(qkv)).
-fn attend(net: Net, block: &Block, qkv: &[f32], mask: FrameMask, to: Attend) {
+fn attend(net: Net, block: &Block, qkv: &[f32], sight: Sight, to: Attend) {
+    let Sight { mask, rope } = sight;
     let (rows, dim) = (mask.frames * mask.tokens, block.dim);
-    let mixed = MatMut::new(to.mixed, rows, dim);
-    attention::attention(net.ctx, Mat::new(qkv, rows, 3 * dim), block.heads, mask, to.heads, mixed);
-    let gamma = block.ls1.map(|g| net.model.values(g));
-    net.linear_onto(&block.proj, Act::None, gamma, Mat::new(to.mixed, rows, dim), MatMut::new(to.x, rows, dim));
+    let (qkv, mixed) = (Mat::new(qkv, rows, 3 * dim), MatMut::new(to.mixed, rows, dim));
+    if block.int8_attention() {
+        let rotation = net.model.head_rotation(&block.proj.weight, dim / block.heads);
+        let x = Heads { qkv, heads: block.heads, norm: head_norm(net, block), rope, rotation };
+        attention::attention_s8(net.ctx, x, mask, to.heads, mixed);
+    } else {
+        attention::attention(net.ctx, qkv, block.heads, mask, to.heads, mixed);
+    }
+    net.linear_onto(&block.proj, Act::None, block.ls1, Mat::new(to.mixed, rows, dim), MatMut::new(to.x, rows, dim));
 }
 
 /// x += ls2 * fc2(gelu(fc1(norm2 x))).
 fn mlp(net: Net, block: &Block, x: &mut [f32], rows: usize, normed: &mut [f32], wide: &mut [f32]) {
     let (dim, hidden) = (block.dim, block.hidden);
-    net.norm(&block.norm2, Mat::new(x, rows, dim), MatMut::new(normed, rows, dim));
     let wide = &mut wide[..rows * hidden];
-    net.linear(&block.fc1, Act::Gelu, Mat::new(normed, rows, dim), MatMut::new(wide, rows, hidden));
-    let gamma = block.ls2.map(|g| net.model.values(g));
-    net.linear_onto(&block.fc2, Act::None, gamma, Mat::new(wide, rows, hidden), MatMut::new(x, rows, dim));
+    let from = (Mat::new(x, rows, dim), normed);
+    net.normed_linear(&block.norm2, &block.fc1, Act::Gelu, from, MatMut::new(wide, rows, hidden));
+    net.linear_onto(&block.fc2, Act::None, block.ls2, Mat::new(wide, rows, hidden), MatMut::new(x, rows, dim));
 }

@@ -7,13 +7,14 @@
 //! once, which is exact because only the mask differs.
 
 use crate::arena::{carve, carved_len};
-use crate::block::{self, BlockShape, Net, Sight};
+use crate::block::{self, BlockShape, Sight};
 use crate::dims::Dims;
 use crate::embed;
 use crate::features::Features;
 use crate::heads::{self, Dense, Source};
 use crate::model::{Block, DenseHead, Model};
 use crate::motion::Reach;
+use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens, causal_tokens};
 use sf_formats::Result;
@@ -22,14 +23,15 @@ use sf_ops::attention::FrameMask;
 use sf_ops::mat::Mat;
 
 /// Tokens per frame.
-fn tokens(config: &ModelConfig, d: &Dims) -> usize {
+pub(crate) fn tokens(config: &ModelConfig, d: &Dims) -> usize {
     match causal_tokens(config) {
         Tokens::WithRegisters => d.tokens,
         Tokens::Patches => d.patches,
     }
 }
 
-fn mask(config: &ModelConfig, d: &Dims, reach: Reach) -> FrameMask {
+/// What each query of a pass sees.
+pub(crate) fn mask(config: &ModelConfig, d: &Dims, reach: Reach) -> FrameMask {
     FrameMask { frames: d.frames, tokens: tokens(config, d), lo: reach.lo, hi: reach.hi }
 }
 
@@ -46,8 +48,9 @@ fn lens(model: &Model, d: &Dims, threads: usize) -> [usize; 5] {
     let (config, w) = (model.config(), model.weights());
     let values = d.frames * tokens(config, d) * config.causal_dim() as usize;
     let (fwd, bwd) = Reach::of(config);
-    let shape = BlockShape::of(&w.causal[0], threads);
-    let block = [Some(fwd), bwd].into_iter().flatten().map(|r| shape.scratch_len(&mask(config, d, r))).max();
+    let most = |r, blocks| BlockShape::most(blocks, &mask(config, d, r), threads);
+    let back = w.causal_back.as_ref().unwrap_or(&w.causal);
+    let block = [Some(most(fwd, &w.causal)), bwd.map(|r| most(r, back))].into_iter().flatten().max();
     let motion = w.motion.as_ref().map_or(0, |head| heads::scratch_len(head, d, d.patches, threads));
     let scratch = block.unwrap_or(0).max(motion).max(values);
     let shared = if w.causal_back.is_none() { 3 * values } else { 0 };
@@ -96,15 +99,21 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
     for ((name, reach, blocks), raw) in passes.into_iter().zip(job.raw.chunks_exact_mut(map_len)) {
         let Some(reach) = reach else { continue };
         x.copy_from_slice(start);
-        // A direction without a neighbour mirrors the other one: its map is never read, so only a tap wants it.
-        let unread = config.render_extrapolate == Extrapolate::Mirror && bwd.is_some() && !probe.tapped();
-        let pass = Pass { net, d, tables, guide: job.guide, mask: mask(config, d, reach), blocks, reach, unread, name };
+        let pass = Pass { net, d, tables, guide: job.guide, mask: mask(config, d, reach), blocks, reach, name };
         let shared = w.causal_back.is_none().then_some(&*shared);
         pass.layers(shared, x, tapped, scratch, probe)?;
+        probe.lap("causal");
         pass.motion(x, tapped, scratch, raw, probe)?;
+        probe.lap("motion");
     }
-    probe.lap("motion");
     Ok(())
+}
+
+/// Whether the map of frame `f` in a pass that reaches this far is read: a direction without a neighbour mirrors the
+/// other one, where there is another.
+pub(crate) fn is_read(config: &ModelConfig, reach: Reach, f: usize, frames: usize) -> bool {
+    let mirrored = config.render_extrapolate == Extrapolate::Mirror && Reach::of(config).1.is_some();
+    !mirrored || reach.has_neighbour(f, frames)
 }
 
 /// Features and time embedding side by side.
@@ -141,8 +150,6 @@ struct Pass<'a> {
     mask: FrameMask,
     blocks: &'a [Block],
     reach: Reach,
-    /// Whether maps of frames without a neighbour in this direction go unread.
-    unread: bool,
     name: &'static str,
 }
 
@@ -159,12 +166,11 @@ impl Pass<'_> {
         let kept = taps(self.net.model);
         let dim = self.blocks[0].dim;
         for (i, block) in self.blocks.iter().enumerate() {
+            let rope = self.tables.rope(dim / block.heads, causal_tokens(self.net.model.config()));
+            let sight = Sight { mask: self.mask, rope: Some(rope) };
             match (i, shared) {
-                (0, Some(qkv)) => block::forward_from(self.net, block, qkv, x, self.mask, scratch),
-                _ => {
-                    let rope = self.tables.rope(dim / block.heads, causal_tokens(self.net.model.config()));
-                    block::forward(self.net, block, x, Sight { mask: self.mask, rope: Some(rope) }, scratch);
-                }
+                (0, Some(qkv)) => block::forward_from(self.net, block, qkv, x, sight, scratch),
+                _ => block::forward(self.net, block, x, sight, scratch),
             }
             probe.layer(format_args!("causal.{}.{i}", self.name), x)?;
             if let Some(slot) = kept.iter().position(|&t| t == i) {
@@ -209,7 +215,8 @@ impl Pass<'_> {
         dense.prepare(source, scratch, probe)?;
         let out = heads::channels(head);
         for (f, map) in raw.chunks_exact_mut(d.pixels() * out).enumerate() {
-            if self.unread && !self.reach.has_neighbour(f, d.frames) {
+            // Only a tap wants a map that is never read.
+            if !is_read(self.net.model.config(), self.reach, f, d.frames) && !probe.tapped() {
                 continue;
             }
             dense.frame(source, f, scratch, map);

@@ -5,8 +5,9 @@
 //! class and patches; registers have none.
 
 use crate::arena::carve;
-use crate::block::{self, Net, Sight};
+use crate::block::{self, Sight};
 use crate::dims::Dims;
+use crate::net::Net;
 use crate::plan::patch_lens;
 use crate::preprocess::Normaliser;
 use crate::probe::Probe;

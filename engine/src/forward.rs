@@ -5,7 +5,6 @@
 
 use crate::aggregator;
 use crate::arena::carve;
-use crate::block::Net;
 use crate::dims::{ClipShape, Dims};
 use crate::features::{Features, Pairs};
 use crate::heads::camera::{self, RawCamera};
@@ -13,6 +12,7 @@ use crate::heads::{self, Dense, Source};
 use crate::input::Input;
 use crate::intrinsics::{self, Evidence};
 use crate::model::{DenseHead, Model};
+use crate::net::Net;
 use crate::output::{Flags, Output};
 use crate::plan::{Plan, trunk_lens};
 use crate::probe::Probe;
@@ -22,6 +22,7 @@ use crate::{causal, encoder, gaussians, motion};
 use sf_formats::config::{Concat, DepthMap, ModelConfig, MotionLayout};
 use sf_formats::{Pose, Result};
 use sf_ops::activation::exp;
+use sf_ops::opclock::{self, Op, Work};
 
 /// Results and small per-frame records of a session.
 pub(crate) struct Memory {
@@ -254,6 +255,7 @@ impl Forward<'_> {
     /// Intrinsics; then everything in scene units, and the centres.
     fn place(&self, memory: &mut Memory, probe: &mut Probe) -> Result<()> {
         let (c, d) = (self.config, &self.plan.dims);
+        let _span = opclock::span(Op::Elementwise, || Work::values(2 * d.frames * d.pixels()));
         let Memory { output: out, fov, views, gaussians, motion, .. } = memory;
         let points = (c.depth_map == DepthMap::Pi3Point).then(|| out.points.as_flattened());
         let evidence = Evidence { user: self.input.k, fov: Some(fov), points };
@@ -319,6 +321,8 @@ impl Forward<'_> {
     /// Activations of one frame; `raw` is its `[height, width, 11]`, or priors are used.
     fn map_gaussians(&self, f: usize, raw: Option<&[f32]>, memory: &mut Memory) {
         let d = &self.plan.dims;
+        // Eleven raw channels in, eleven values out.
+        let _span = opclock::span(Op::Elementwise, || Work::values(gaussians::CHANNELS * d.pixels()));
         let (w, pixels) = (d.width, f * d.pixels()..(f + 1) * d.pixels());
         let (out, map, pool) = (&mut memory.output, &memory.gaussians[f], self.net.ctx.pool);
         let conf = (!out.conf.is_empty()).then(|| &out.conf[pixels.clone()]);
@@ -337,6 +341,7 @@ impl Forward<'_> {
     fn velocities(&self, raw: &[f32], memory: &mut Memory) {
         let (c, d) = (self.config, &self.plan.dims);
         let (w, channels) = (d.width, c.motion.out as usize);
+        let _span = opclock::span(Op::Elementwise, || Work::values(7 * d.frames * d.pixels()));
         let (fwd, bwd) = match c.motion_layout {
             MotionLayout::PerDirection => raw.split_at(raw.len() / 2),
             MotionLayout::SinglePass => (raw, &raw[..0]),

@@ -6,11 +6,12 @@
 //! | `session.rs` | [`Session`]: a model ready for clips of one shape; [`Options`] |
 //! | `dims.rs` | [`ClipShape`]: what a session is made for, checked once; its token counts |
 //! | `plan.rs` `arena.rs` | [`Plan`]: every size before the first frame; the one block of memory |
+//! | `cost.rs` | [`Cost`]: the multiply-adds of a run, stage by stage |
 //! | `input.rs` `preprocess.rs` | [`Input`]: frames at the network's size; resizing to it |
 //! | `forward.rs` | the order of the network |
 //! | `encoder.rs` | DINOv2 with registers, frame by frame |
 //! | `aggregator.rs` | alternating frame and global attention |
-//! | `block.rs` | the one transformer block |
+//! | `block.rs` `net.rs` | the one transformer block; linear layers of every precision |
 //! | `features.rs` | the tokens that heads read, where they lie |
 //! | `heads/` | camera, linear, guided and DPT heads |
 //! | `causal.rs` | the two masked passes over time |
@@ -47,6 +48,7 @@ mod aggregator;
 mod arena;
 mod block;
 mod causal;
+mod cost;
 mod dims;
 mod embed;
 mod encoder;
@@ -58,6 +60,7 @@ mod input;
 mod intrinsics;
 mod model;
 mod motion;
+mod net;
 mod output;
 mod plan;
 pub mod preprocess;
@@ -68,6 +71,7 @@ mod session;
 mod tables;
 mod unproject;
 
+pub use cost::{Cost, StageCost};
 pub use dims::{ClipShape, MAX_FRAMES, MAX_PIXELS, MAX_TOKENS};
 pub use input::Input;
 pub use model::Model;

@@ -7,18 +7,35 @@
 use sf_formats::blob::{Blob, Dtype, LoadMode, Verify};
 use sf_formats::config::{Head, HeadKind, KSource, ModelConfig, RcuSkip, Trunk};
 use sf_formats::{Error, Result};
-use sf_ops::gemm::{PanelData, Panels};
+use sf_ops::gemm::{PanelData, Panels, PanelsS8};
+use sf_ops::hadamard::Rotation;
+use sf_ops::simd::LANES;
 use std::path::Path;
 
 /// A matrix in panels, `[n, k]`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PanelRef {
     tensor: usize,
-    half: bool,
+    dtype: Dtype,
     /// Outputs.
     pub(crate) n: usize,
     /// Inputs.
     pub(crate) k: usize,
+}
+
+impl PanelRef {
+    /// Whether activations are quantized for it.
+    pub(crate) fn is_int8(&self) -> bool {
+        self.dtype == Dtype::Int8
+    }
+}
+
+/// The panels behind a handle.
+pub(crate) enum Weight<'a> {
+    /// f32 or f16.
+    Float(Panels<'a>),
+    /// int8; inputs are rotated before they are quantized.
+    Int8(PanelsS8<'a>, Option<Rotation<'a>>),
 }
 
 /// A vector or table in f32.
@@ -38,6 +55,8 @@ pub(crate) struct Norm {
     pub(crate) gain: VecRef,
     pub(crate) offset: VecRef,
     pub(crate) eps: f32,
+    /// Whether gain and offset do nothing: they are folded into what follows.
+    pub(crate) plain: bool,
 }
 
 /// One transformer block.
@@ -56,6 +75,13 @@ pub(crate) struct Block {
     pub(crate) fc1: Linear, // [hidden, dim]
     pub(crate) fc2: Linear, // [dim, hidden]
     pub(crate) ls2: Option<VecRef>,
+}
+
+impl Block {
+    /// Whether attention runs in int8: the layers around it do.
+    pub(crate) fn int8_attention(&self) -> bool {
+        self.qkv.weight.is_int8() && self.proj.weight.is_int8()
+    }
 }
 
 /// Pi3's decoder: projection, blocks, projection.
@@ -228,10 +254,33 @@ impl Model {
     }
 
     /// The panels behind a handle.
+    pub(crate) fn weight(&self, r: &PanelRef) -> Weight<'_> {
+        let data = match r.dtype {
+            Dtype::F32 => PanelData::F32(self.blob.f32s(r.tensor)),
+            Dtype::F16 => PanelData::F16(self.blob.f16s(r.tensor)),
+            Dtype::Int8 => {
+                let m = self.blob.int8(r.tensor);
+                let rotation = (!m.signs.is_empty()).then(|| Rotation::new(r.k, m.signs));
+                let panels = PanelsS8 { n: r.n, k: r.k, data: m.data, scales: m.scales, col_sums: m.sums };
+                return Weight::Int8(panels, rotation);
+            }
+        };
+        Weight::Float(Panels { n: r.n, k: r.k, data })
+    }
+
+    /// The rotation of heads of width `d` in front of int8 scores: the first signs of the output projection, for any
+    /// random ones will do. None where the width has none.
+    pub(crate) fn head_rotation(&self, proj: &PanelRef, d: usize) -> Option<Rotation<'_>> {
+        let signs = self.blob.int8(proj.tensor).signs;
+        (d.is_multiple_of(LANES) && signs.len() >= d / LANES).then(|| Rotation::new(d, &signs[..d / LANES]))
+    }
+
+    /// The panels behind the handle of a convolution, which is never int8.
     pub(crate) fn panels(&self, r: &PanelRef) -> Panels<'_> {
-        let data =
-            if r.half { PanelData::F16(self.blob.f16s(r.tensor)) } else { PanelData::F32(self.blob.f32s(r.tensor)) };
-        Panels { n: r.n, k: r.k, data }
+        match self.weight(r) {
+            Weight::Float(panels) => panels,
+            Weight::Int8(..) => unreachable!("refused when the model was made"),
+        }
     }
 
     /// The values behind a handle.
@@ -253,13 +302,24 @@ impl Lookup<'_> {
     fn panels(&self, name: &str, n: usize, k: usize) -> Result<PanelRef> {
         let tensor = self.find(name)?;
         let record = &self.blob.tensors()[tensor];
-        let half = record.dtype == Dtype::F16;
-        let have = if half { self.blob.f16s(tensor).len() } else { self.blob.f32s(tensor).len() };
-        let need = sf_ops::gemm::panel_len(n, k);
+        let (have, need) = match record.dtype {
+            Dtype::F32 => (self.blob.f32s(tensor).len(), sf_ops::gemm::panel_len(n, k)),
+            Dtype::F16 => (self.blob.f16s(tensor).len(), sf_ops::gemm::panel_len(n, k)),
+            Dtype::Int8 => (self.blob.int8(tensor).data.len(), sf_ops::gemm::panel_len_s8(n, k)),
+        };
         if have != need {
             return Err(Error::model(name, format!("{have} values in panels, {n} x {k} needs {need}")));
         }
-        Ok(PanelRef { tensor, half, n, k })
+        Ok(PanelRef { tensor, dtype: record.dtype, n, k })
+    }
+
+    /// Panels of a convolution with a window, or one that runs as such.
+    fn conv_panels(&self, name: &str, n: usize, k: usize) -> Result<PanelRef> {
+        let panels = self.panels(name, n, k)?;
+        if panels.is_int8() {
+            return Err(Error::unsupported(name, "a convolution in int8: convert it to f16"));
+        }
+        Ok(panels)
     }
 
     fn values(&self, name: &str, len: usize) -> Result<VecRef> {
@@ -277,12 +337,20 @@ impl Lookup<'_> {
     }
 
     fn conv(&self, name: &str, out: usize, inputs: usize, kernel: usize) -> Result<Linear> {
-        self.linear(name, out, kernel * kernel * inputs)
+        let weight = self.conv_panels(&format!("{name}.weight"), out, kernel * kernel * inputs)?;
+        Ok(Linear { weight, bias: Some(self.values(&format!("{name}.bias"), out)?) })
     }
 
     fn norm(&self, name: &str, dim: usize, eps: f64) -> Result<Norm> {
         let gain = self.values(&format!("{name}.weight"), dim)?;
-        Ok(Norm { gain, offset: self.values(&format!("{name}.bias"), dim)?, eps: eps as f32 })
+        let offset = self.values(&format!("{name}.bias"), dim)?;
+        let plain = self.all(gain, 1.0) && self.all(offset, 0.0);
+        Ok(Norm { gain, offset, eps: eps as f32, plain })
+    }
+
+    /// Whether every value of a vector is `value`.
+    fn all(&self, r: VecRef, value: f32) -> bool {
+        self.blob.f32s(r.0).iter().all(|&v| v == value)
     }
 
     fn block(&self, p: &str, t: &Trunk, kind: BlockKind) -> Result<Block> {
@@ -291,7 +359,8 @@ impl Lookup<'_> {
         let norm = |name: &str| self.norm(&format!("{p}.{name}"), dim, t.eps);
         let scale = |name: &str| match kind {
             BlockKind::Decoder => Ok(None),
-            _ => self.values(&format!("{p}.{name}.gamma"), dim).map(Some),
+            // Ones do nothing: they are folded into the matrix in front.
+            _ => self.values(&format!("{p}.{name}.gamma"), dim).map(|g| (!self.all(g, 1.0)).then_some(g)),
         };
         let qk = match kind {
             BlockKind::Aa => {
@@ -344,14 +413,15 @@ impl Lookup<'_> {
                 out: self.conv(&format!("{r}.out_conv"), f, f, 1)?,
             })
         };
-        let project = |i: usize| self.conv(&format!("{p}.projects.{i}"), channels[i], inputs, 1);
+        // 1x1 convolutions that run as linear layers.
+        let project = |i: usize| self.linear(&format!("{p}.projects.{i}"), channels[i], inputs);
         let lateral = |i: usize| -> Result<Linear> {
-            let weight = self.panels(&format!("{s}.layer{}_rn.weight", i + 1), f, 9 * channels[i])?;
+            let weight = self.conv_panels(&format!("{s}.layer{}_rn.weight", i + 1), f, 9 * channels[i])?;
             Ok(Linear { weight, bias: None })
         };
         let up = |i: usize, k: usize| -> Result<Linear> {
             let c = channels[i];
-            let weight = self.panels(&format!("{p}.resize_layers.{i}.weight"), k * k * c, c)?;
+            let weight = self.conv_panels(&format!("{p}.resize_layers.{i}.weight"), k * k * c, c)?;
             Ok(Linear { weight, bias: Some(self.values(&format!("{p}.resize_layers.{i}.bias"), c)?) })
         };
         let (hidden, out) = (h.hidden as usize, h.out as usize);

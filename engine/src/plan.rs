@@ -6,6 +6,7 @@
 //! | guide | the image stem to the motion passes | what guided heads see of the images |
 //! | motion | motion passes to the end | raw motion maps |
 //! | work | one stage | working memory of the stage in progress |
+//! | rows | one layer | quantized input rows of the int8 layer in progress |
 //!
 //! Stages never overlap in time, so `work` is as large as the largest one. The same functions that size
 //! an area also carve it.
@@ -16,7 +17,8 @@ use crate::causal;
 use crate::dims::{ClipShape, Dims};
 use crate::gaussians;
 use crate::heads;
-use crate::model::{DenseHead, Model};
+use crate::model::{Block, Decoder, DenseHead, Model};
+use crate::net::Rows;
 use sf_formats::config::{DepthMap, Head, HeadKind, ModelConfig, MotionLayout};
 use sf_formats::{Error, Result};
 use sf_ops::attention::FrameMask;
@@ -33,6 +35,8 @@ pub struct Plan {
     pub(crate) pairs: Vec<usize>,
     /// Values of all kept pairs, of the image stem, of the raw motion maps, of the working memory.
     pub(crate) areas: [usize; 4],
+    /// Values of the quantized rows of an int8 layer.
+    pub(crate) rows: usize,
     stages: Vec<(&'static str, usize)>,
     output_values: usize,
     layers: u32,
@@ -83,6 +87,7 @@ impl Plan {
             dims,
             pairs,
             areas,
+            rows: rows(model, &dims),
             stages,
             output_values: n * dims.pixels() * crate::output::values_per_pixel(config),
             layers: layers(config, n),
@@ -115,14 +120,36 @@ impl Plan {
         self.layers
     }
 
-    /// Bytes of the arena.
+    /// Bytes of working memory.
     pub fn arena_bytes(&self) -> u64 {
-        4 * carved_len(self.areas) as u64
+        4 * (carved_len(self.areas) + self.rows) as u64
     }
 
     /// Bytes of the results a session holds.
     pub fn output_bytes(&self) -> u64 {
         4 * self.output_values as u64
+    }
+
+    /// Bytes of the frames that a run reads.
+    pub fn input_bytes(&self) -> u64 {
+        3 * (self.dims.frames * self.dims.pixels()) as u64
+    }
+
+    /// Bytes of the scene made of the results, one Gaussian per pixel: centre, scale, quaternion, opacity, colour,
+    /// two velocities, dynamic probability, source frame.
+    pub fn scene_bytes(&self) -> u64 {
+        4 * (3 + 3 + 4 + 1 + 3 + 3 + 3 + 1 + 1) * (self.dims.frames * self.dims.pixels()) as u64
+    }
+
+    /// Bytes of the arena's areas by name.
+    pub fn areas_bytes(&self) -> Vec<(&'static str, u64)> {
+        let names = ["pairs", "guide", "motion", "work"];
+        names.into_iter().zip(self.areas).map(|(name, values)| (name, 4 * values as u64)).collect()
+    }
+
+    /// Bytes of working memory that each stage asks for; the area holds the largest.
+    pub fn work_bytes(&self) -> Vec<(&'static str, u64)> {
+        self.stages.iter().map(|&(name, values)| (name, 4 * values as u64)).collect()
     }
 }
 
@@ -157,17 +184,52 @@ impl fmt::Display for Plan {
         for (name, values) in &self.stages {
             writeln!(f, "    {:9.2} MiB {name}", mib(*values))?;
         }
+        if self.rows > 0 {
+            writeln!(f, "  rows      {:9.2} MiB (input of an int8 layer)", mib(self.rows))?;
+        }
         write!(f, "results     {:9.2} MiB", mib(self.output_values))
     }
+}
+
+/// Values of quantized rows: the most that any int8 layer needs.
+fn rows(model: &Model, d: &Dims) -> usize {
+    let (w, config) = (model.weights(), model.config());
+    let blocks = |blocks: &[Block], m: usize| -> usize {
+        let layers = blocks.iter().flat_map(|b| [&b.qkv, &b.proj, &b.fc1, &b.fc2]);
+        layers.map(|l| Rows::len(&l.weight, m)).max().unwrap_or(0)
+    };
+    let decoder = |x: &Decoder, m: usize| {
+        blocks(&x.blocks, m).max(Rows::len(&x.projects.weight, m)).max(Rows::len(&x.linear_out.weight, m))
+    };
+    let head = |head: &DenseHead, m: usize| match head {
+        DenseHead::Linear(h) => decoder(&h.decoder, m).max(Rows::len(&h.proj.weight, d.patches)),
+        DenseHead::Guided(h) => decoder(&h.decoder, m).max(Rows::len(&h.proj.weight, d.patches)),
+        DenseHead::Dpt(h) => h.projects.iter().map(|l| Rows::len(&l.weight, d.patches)).max().unwrap_or(0),
+    };
+    let all = d.frames * d.tokens;
+    let mut most = blocks(&w.encoder, d.frames * d.encoder_tokens).max(blocks(&w.aa, all));
+    most = most.max(w.aa_time.map_or(0, |l| Rows::len(&l.weight, 1)));
+    let camera = w.camera.units.iter().flatten().chain(&w.camera.mlps).chain([&w.camera.t, &w.camera.rot]);
+    let camera = camera.chain(&w.camera.fov).map(|l| Rows::len(&l.weight, d.patches)).max().unwrap_or(0);
+    most = most.max(decoder(&w.camera.decoder, all)).max(camera);
+    for dense in [Some(&w.depth), w.conf.as_ref(), w.gs.as_ref()].into_iter().flatten() {
+        most = most.max(head(dense, all));
+    }
+    if config.has_motion() && d.frames > 1 {
+        let m = d.frames * causal::tokens(config, d);
+        most = most.max(blocks(&w.causal, m)).max(w.causal_back.as_ref().map_or(0, |b| blocks(b, m)));
+        most = most.max(w.motion.as_ref().map_or(0, |h| head(h, m)));
+    }
+    most
 }
 
 /// Encoder tokens, aggregator tokens, block scratch (also the patch embedding's image and scratch).
 pub(crate) fn trunk_lens(model: &Model, dims: &Dims, threads: usize) -> [usize; 3] {
     let (w, dim) = (model.weights(), model.config().aa.dim as usize);
-    let block = |block, mask: FrameMask| BlockShape::of(block, threads).scratch_len(&mask);
-    let scratch = block(&w.encoder[0], dims.frame_mask(dims.encoder_tokens))
-        .max(block(&w.aa[0], dims.frame_mask(dims.tokens)))
-        .max(block(&w.aa[0], dims.global_mask()))
+    let most = |blocks: &[Block], mask: FrameMask| BlockShape::most(blocks, &mask, threads);
+    let scratch = most(&w.encoder, dims.frame_mask(dims.encoder_tokens))
+        .max(most(&w.aa, dims.frame_mask(dims.tokens)))
+        .max(most(&w.aa, dims.global_mask()))
         .max(carved_len(patch_lens(model.config(), dims)));
     [dims.frames * dims.encoder_tokens * dim, dims.frames * dims.tokens * dim, scratch]
 }

@@ -11,6 +11,7 @@ use sf_formats::clip::Clip;
 use sf_formats::config::{ModelConfig, Resample};
 use sf_formats::{Error, Intrinsics, Result};
 use sf_ops::cpu::DefaultFloatMode;
+use sf_ops::opclock::{self, Op, Work};
 use sf_ops::resize::{Filter, resample_u8};
 
 /// Pixels per frame the public model was trained with at most (Pi3's loader).
@@ -152,6 +153,7 @@ impl Normaliser {
     /// `[h, w, 3]` bytes to values.
     pub(crate) fn apply(&self, bytes: &[u8], out: &mut [f32]) {
         assert_eq!(bytes.len(), out.len(), "bytes and values of an image");
+        let _span = opclock::span(Op::Glue, || Work { macs: 0, bytes: 5 * out.len() as u64 });
         for (from, to) in bytes.chunks_exact(3).zip(out.chunks_exact_mut(3)) {
             for c in 0..3 {
                 to[c] = self.0[c][usize::from(from[c])];

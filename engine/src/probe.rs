@@ -2,6 +2,7 @@
 //! count of finished layers and the stage clock.
 
 use sf_formats::{Error, Result};
+use sf_ops::opclock::{self, Op, Work};
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
@@ -23,8 +24,8 @@ pub struct Tap<'a> {
 pub type TapFn<'a> = &'a mut dyn FnMut(&Tap);
 
 /// Stages of the clock, in the order of execution.
-pub(crate) const STAGES: [&str; 9] =
-    ["preprocess", "encoder", "aa.frame", "aa.global", "camera", "depth", "conf", "gaussians", "motion"];
+pub(crate) const STAGES: [&str; 10] =
+    ["preprocess", "encoder", "aa.frame", "aa.global", "camera", "depth", "conf", "gaussians", "causal", "motion"];
 
 /// What the outside of a run sees of it, and how it stops it.
 #[derive(Clone, Copy)]
@@ -79,6 +80,7 @@ impl<'a, 't> Probe<'a, 't> {
         {
             return Err(Error::Deadline(format!("deadline passed after {stage}")));
         }
+        let _span = opclock::span(Op::Glue, || Work { macs: 0, bytes: 4 * data.len() as u64 });
         if !all_finite(data) {
             let bad = data.iter().filter(|v| !v.is_finite()).count();
             return Err(Error::integrity(

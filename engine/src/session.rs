@@ -4,11 +4,11 @@
 //! the network is in `forward.rs`.
 
 use crate::arena::{Arena, carve, carved_len, filled};
-use crate::block::Net;
 use crate::dims::ClipShape;
 use crate::forward::{self, Areas, Forward, Memory};
 use crate::input::Input;
 use crate::model::Model;
+use crate::net::{Net, Rows};
 use crate::output::Output;
 use crate::plan::{DEFAULT_MAX_BYTES, Plan};
 use crate::probe::{Probe, STAGES, TapFn, Watch};
@@ -57,6 +57,7 @@ pub struct Session {
     plan: Plan,
     tables: Tables,
     arena: Arena,
+    rows: Rows,
     memory: Memory,
     /// Whether `memory.output` is a whole result.
     complete: bool,
@@ -126,6 +127,7 @@ impl Session {
             .map_err(|e| Error::resource("threads", format!("the system refused {threads} threads: {e}")))?;
         meet(&pool);
         let arena = Arena::new(carved_len(plan.areas))?;
+        let rows = Rows::new(plan.rows)?;
         let memory = Memory::new(&model, shape)?;
         let tables = Tables::new(&model, &plan.dims);
         let cancel = Arc::new(AtomicBool::new(false));
@@ -136,6 +138,7 @@ impl Session {
             plan,
             tables,
             arena,
+            rows,
             memory,
             complete: false,
             window: None,
@@ -218,7 +221,7 @@ impl Session {
         taps: Option<TapFn>,
     ) -> Result<()> {
         let [pairs, guide, motion, work] = carve(self.arena.all(), self.plan.areas);
-        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
+        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline };
         let mut probe = Probe::new(taps, watch, &mut self.times);
@@ -278,7 +281,7 @@ impl Session {
 
     fn encode(&mut self, image: &[u8], window: &mut Window) -> Result<()> {
         let [_, _, _, work] = carve(self.arena.all(), self.plan.areas);
-        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model };
+        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline: None };
         let mut probe = Probe::new(None, watch, &mut self.times);
         forward::encode_frame(net, &self.plan, &self.tables, image, (work, &mut window.newest), &mut probe)

@@ -76,6 +76,13 @@ impl AtomicFile {
         result.map_err(|e| Error::io(&self.target, "write", &e))
     }
 
+    /// The temporary file, with everything written so far in it.
+    pub fn flushed(&mut self) -> Result<&Path> {
+        let result = self.writer().flush();
+        result.map_err(|e| Error::io(&self.target, "write", &e))?;
+        Ok(&self.temp)
+    }
+
     /// Flushes to disk and renames over the target.
     pub fn commit(mut self) -> Result<()> {
         let file = self.file.take().expect("file is open until commit");

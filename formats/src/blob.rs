@@ -15,6 +15,7 @@ use crate::map;
 use crate::meta::Meta;
 use crate::open::{Identity, open_regular};
 use crate::panel::Order;
+use crate::panel_s8::{Int8, unrotate};
 use half::f16;
 use std::fs::File;
 use std::io::Read;
@@ -160,10 +161,21 @@ impl Blob {
         bytemuck::cast_slice(self.bytes(i))
     }
 
-    /// Values of tensor `i` in checkpoint order into `out`, whatever way they are stored.
+    /// Parts of tensor `i`, which must be of type int8.
+    pub fn int8(&self, i: usize) -> Int8<'_> {
+        Int8::new(self.parsed.tensors[i].int8_layout(), self.bytes(i))
+    }
+
+    /// Values of tensor `i` in checkpoint order into `out`, whatever way they are stored. An int8 matrix is
+    /// multiplied by its scales and its rotation undone: what the network computes with.
     pub fn read_f32(&self, i: usize, out: &mut Vec<f32>) {
         let t = &self.parsed.tensors[i];
         out.clear();
+        if t.dtype == Dtype::Int8 {
+            out.resize(t.spec.len(), 0.0);
+            self.read_int8(i, out);
+            return;
+        }
         let Some(order) = Order::of(&t.spec) else {
             out.extend_from_slice(self.f32s(i));
             return;
@@ -174,6 +186,7 @@ impl Blob {
             let range = p * panel.len()..(p + 1) * panel.len();
             match t.dtype {
                 Dtype::F32 => panel.copy_from_slice(&self.f32s(i)[range]),
+                Dtype::Int8 => unreachable!("read by its own function"),
                 Dtype::F16 => {
                     for (v, &bits) in panel.iter_mut().zip(&self.f16s(i)[range]) {
                         *v = f16::from_bits(bits).to_f32();
@@ -181,6 +194,24 @@ impl Blob {
                 }
             }
             order.unpack(p, &panel, out);
+        }
+    }
+
+    fn read_int8(&self, i: usize, out: &mut [f32]) {
+        let m = self.int8(i);
+        let order = Order::of(&self.parsed.tensors[i].spec).expect("int8 tensors are matrices");
+        let (n, k) = (m.layout.n, m.layout.k);
+        let mut row = vec![0.0f64; k];
+        for o in 0..n {
+            for (i, v) in row.iter_mut().enumerate() {
+                *v = f64::from(m.data[m.layout.place(o, i)]) * f64::from(m.scales[o]);
+            }
+            if !m.signs.is_empty() {
+                row.chunks_exact_mut(16 * m.signs.len()).for_each(|channels| unrotate(channels, m.signs));
+            }
+            for (i, v) in row.iter().enumerate() {
+                out[order.at(o, i)] = *v as f32;
+            }
         }
     }
 

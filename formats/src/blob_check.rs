@@ -13,6 +13,7 @@ use crate::digest::{Digest, hex, sha256};
 use crate::error::{Error, Result, escape};
 use crate::meta::{self, Meta};
 use crate::panel::LANES;
+use crate::panel_s8::{self, Int8Layout};
 use crate::sniff::FileKind;
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
@@ -34,6 +35,19 @@ pub struct TensorRecord {
     pub bytes: usize,
     /// SHA-256 of those bytes.
     pub digest: Digest,
+    /// Values of a block of the inputs' rotation, 0 without one; int8 matrices only.
+    pub rotation: usize,
+}
+
+impl TensorRecord {
+    /// Where the parts of an int8 matrix lie.
+    ///
+    /// # Panics
+    /// When the tensor is not of type int8.
+    pub fn int8_layout(&self) -> Int8Layout {
+        assert_eq!(self.dtype, Dtype::Int8, "type of {}", self.spec.name);
+        Int8Layout::of(&self.spec, self.rotation != 0).expect("checked on opening")
+    }
 }
 
 /// What a valid file says.
@@ -220,6 +234,7 @@ struct Record<'a> {
     offset: usize,
     bytes: usize,
     digest: Digest,
+    rotation: usize,
 }
 
 /// Reads the records; extents, padding and names are valid and unique afterwards.
@@ -270,10 +285,11 @@ fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> 
     };
     let (code, order) = (record::DTYPE.number(row) as u8, record::LAYOUT.number(row) as u8);
     let (Some(dtype), Some(order)) = (Dtype::from_code(code), Layout::from_code(order)) else {
-        let known = if code == layout::DTYPE_S8 || order == layout::LAYOUT_K4N16 { "reserved" } else { "unknown" };
         return Err(Error::unsupported(
             shown(),
-            format!("type {code}, layout {order} is {known}; this program reads f32 and f16, row-major and K1N16"),
+            format!(
+                "type {code}, layout {order} is unknown; this program reads f32, f16, int8; RowMajor, K1N16, K4N16"
+            ),
         ));
     };
     if record::RESERVED.of(row).iter().any(|&b| b != 0) {
@@ -294,7 +310,7 @@ fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> 
         return bad(format!("{length} bytes at {offset} run past the end of the file at {file}"));
     }
     let values = dims[..rank].iter().try_fold(dtype.size() as u64, |n, &d| n.checked_mul(u64::from(d)));
-    // Panels are filled up to 16 outputs; their exact length is checked where the role is known.
+    // Panels are filled up, int8 ones have scales, sums and signs: the exact length is checked where the role is known.
     let fits = values.is_some_and(|v| if order == Layout::RowMajor { v == length } else { v <= length });
     if !fits {
         return bad(format!("shape {:?} of {} is not {length} bytes", &dims[..rank], dtype.name()));
@@ -311,7 +327,17 @@ fn extent<'a>(row: &[u8], name: &'a [u8], (end, file): (u64, u64), at: &str) -> 
     let mut digest = [0; 32];
     digest.copy_from_slice(record::DIGEST.of(row));
     let shape = dims[..rank].iter().map(|&d| d as usize).collect();
-    Ok(Record { name: text, shape, dtype, layout: order, offset: offset as usize, bytes: length as usize, digest })
+    let rotation = record::ROTATION.number(row) as usize;
+    Ok(Record {
+        name: text,
+        shape,
+        dtype,
+        layout: order,
+        offset: offset as usize,
+        bytes: length as usize,
+        digest,
+        rotation,
+    })
 }
 
 /// Pairs the records with what the network needs: nothing missing, nothing extra, every shape equal,
@@ -332,6 +358,7 @@ fn match_specs(records: Vec<Record>, specs: Vec<TensorSpec>, at: &str) -> Result
                 offset: r.offset,
                 bytes: r.bytes,
                 digest: r.digest,
+                rotation: r.rotation,
             }),
         }
     }
@@ -347,25 +374,37 @@ fn match_specs(records: Vec<Record>, specs: Vec<TensorSpec>, at: &str) -> Result
         return Err(Error::model(at, format!("tensors do not match the configuration: {}", faults.join("; "))));
     }
     for t in &tensors {
-        let (order, values) = match t.spec.matrix() {
-            Some((n, k)) => (Layout::K1N16, n.checked_next_multiple_of(LANES).and_then(|n| n.checked_mul(k))),
-            None => (Layout::RowMajor, Some(t.spec.len())),
+        let fault = |why: String| Err(Error::model(format!("{at}: tensor {}", t.spec.name), why));
+        let (order, dtype_fits) = match t.spec.matrix() {
+            Some(_) => (Layout::of_matrix(t.dtype), true),
+            None => (Layout::RowMajor, t.dtype == Dtype::F32),
         };
-        let shown = || format!("{at}: tensor {}", t.spec.name);
-        if t.layout != order || (order == Layout::RowMajor && t.dtype != Dtype::F32) {
-            return Err(Error::model(
-                shown(),
-                format!(
-                    "stored as {} {}; matrices are K1N16, vectors and tables RowMajor f32",
-                    t.layout.name(),
-                    t.dtype.name()
-                ),
+        if t.layout != order || !dtype_fits {
+            return fault(format!(
+                "stored as {} {}; matrices are K1N16 f32 or f16 or K4N16 int8, vectors and tables RowMajor f32",
+                t.layout.name(),
+                t.dtype.name()
             ));
         }
-        if values.and_then(|v| v.checked_mul(t.dtype.size())) != Some(t.bytes) {
-            return Err(Error::model(
-                shown(),
-                format!("shape {:?} as {} {} is not {} bytes", t.spec.shape, t.layout.name(), t.dtype.name(), t.bytes),
+        if t.rotation != 0 {
+            let width = panel_s8::rotated_width(&t.spec).filter(|_| t.dtype == Dtype::Int8);
+            let block = width.and_then(panel_s8::rotation_block);
+            if block != Some(t.rotation) {
+                return fault(format!("a rotation by blocks of {} does not fit it", t.rotation));
+            }
+        }
+        let bytes = match (t.spec.matrix(), t.dtype) {
+            (Some(_), Dtype::Int8) => Int8Layout::of(&t.spec, t.rotation != 0).map(|s| s.bytes()),
+            (Some((n, k)), _) => n.checked_next_multiple_of(LANES).and_then(|n| n.checked_mul(k * t.dtype.size())),
+            (None, _) => t.spec.len().checked_mul(t.dtype.size()),
+        };
+        if bytes != Some(t.bytes) {
+            return fault(format!(
+                "shape {:?} as {} {} is not {} bytes",
+                t.spec.shape,
+                t.layout.name(),
+                t.dtype.name(),
+                t.bytes
             ));
         }
     }
@@ -412,6 +451,9 @@ fn verify_tensor(bytes: &[u8], t: &TensorRecord, at: &str) -> Result<()> {
     }
     // Exponent bits all set: NaN or infinite.
     let bad = match t.dtype {
+        Dtype::Int8 => {
+            return check_int8(bytes, t).map_or(Ok(()), |why| Err(Error::model(shown(), why)));
+        }
         Dtype::F32 => first(bytes, |v| u32::from_le_bytes(v) & 0x7f80_0000 == 0x7f80_0000),
         Dtype::F16 => first(bytes, |v| u16::from_le_bytes(v) & 0x7c00 == 0x7c00),
     };
@@ -429,6 +471,52 @@ fn verify_tensor(bytes: &[u8], t: &TensorRecord, at: &str) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// What is wrong with the values of an int8 matrix.
+fn check_int8(bytes: &[u8], t: &TensorRecord) -> Option<String> {
+    let s = t.int8_layout();
+    let minus_128 = first(&bytes[..s.panels()], |[v]: [u8; 1]| v == 0x80);
+    if let Some(i) = minus_128 {
+        return Some(format!("byte {i} is -128; values are -127 to 127"));
+    }
+    // Unaligned where a test gives the bytes from anywhere.
+    let number = |at: usize, o: usize| {
+        let b = &bytes[at + 4 * o..][..4];
+        u32::from_le_bytes([b[0], b[1], b[2], b[3]])
+    };
+    let limits = 1.0 / panel_s8::MAX_SCALE..=panel_s8::MAX_SCALE;
+    for o in 0..s.n {
+        let scale = f32::from_bits(number(s.scales(), o));
+        if !limits.contains(&scale) {
+            return Some(format!("the scale of output {o} is {scale:e}; it must be within 2^-60..2^60"));
+        }
+    }
+    let zero = |range: Range<usize>| bytes[range].iter().all(|&b| b == 0);
+    if !zero(s.scales() + 4 * s.n..s.sums()) || !zero(s.sums() + 4 * s.n..s.signs()) {
+        return Some(format!("scales or sums of unused outputs (beyond {}) are not zero", s.n));
+    }
+    let quads = s.k.div_ceil(panel_s8::QUAD);
+    let mut sums = vec![0i32; s.lanes()];
+    for (panel, sums) in bytes[..s.panels()].chunks_exact(quads * panel_s8::STEP).zip(sums.chunks_exact_mut(LANES)) {
+        for step in panel.as_chunks::<{ panel_s8::STEP }>().0 {
+            for (sum, quad) in sums.iter_mut().zip(step.as_chunks::<{ panel_s8::QUAD }>().0) {
+                *sum += quad.iter().map(|&b| i32::from(b as i8)).sum::<i32>();
+            }
+        }
+    }
+    for (o, sum) in sums[..s.n].iter().enumerate() {
+        let stored = number(s.sums(), o) as i32;
+        if stored != *sum {
+            return Some(format!("the stored sum of output {o} is {stored}, its values add up to {sum}"));
+        }
+    }
+    let unused = (s.n..s.lanes()).any(|o| (0..s.k).any(|i| bytes[s.place(o, i)] != 0));
+    let beyond = s.k..s.k.next_multiple_of(panel_s8::QUAD);
+    if unused || (0..s.lanes()).any(|o| beyond.clone().any(|i| bytes[s.place(o, i)] != 0)) {
+        return Some(format!("values beyond its {} outputs or {} inputs are not zero", s.n, s.k));
+    }
+    None
 }
 
 /// Index of the first value with a property. The common answer, none, is found without a branch per

@@ -56,7 +56,7 @@ pub const MAGIC_BYTES: [u8; 8] = [0x89, b'S', b'F', b'W', 0x0d, 0x0a, 0x1a, 0x0a
 /// Reads as 0x01020304 only in the right byte order.
 pub const ENDIAN_WORD: u32 = 0x0102_0304;
 /// Format version written; a reader takes every minor of this major.
-pub const VERSION: (u16, u16) = (1, 0);
+pub const VERSION: (u16, u16) = (1, 1);
 /// Architecture id of the StreetForward network.
 pub const ARCHITECTURE_STREETFORWARD: u32 = 1;
 /// Digest algorithm id of SHA-256.
@@ -185,12 +185,14 @@ pub mod record {
     pub const LENGTH: Field = Field::new("length", 40, 8);
     /// Their SHA-256.
     pub const DIGEST: Field = Field::new("digest", 48, 32);
+    /// Values of a block of the rotation of an int8 matrix's inputs; 0 where they are not rotated.
+    pub const ROTATION: Field = Field::new("rotation", 80, 4);
     /// Zero.
-    pub const RESERVED: Field = Field::new("reserved", 80, 16);
+    pub const RESERVED: Field = Field::new("reserved", 84, 12);
 
     /// All of them, in order.
-    pub const ALL: [Field; 10] =
-        [NAME_OFFSET, NAME_LENGTH, DTYPE, LAYOUT, RANK, DIMS, OFFSET, LENGTH, DIGEST, RESERVED];
+    pub const ALL: [Field; 11] =
+        [NAME_OFFSET, NAME_LENGTH, DTYPE, LAYOUT, RANK, DIMS, OFFSET, LENGTH, DIGEST, ROTATION, RESERVED];
 }
 
 /// Type of stored values.
@@ -201,17 +203,17 @@ pub enum Dtype {
     F32 = 1,
     /// IEEE 754 binary16; arithmetic stays f32.
     F16 = 2,
+    /// Signed bytes in [-127, 127] with one f32 scale per output; matrices only.
+    Int8 = 3,
 }
 
-/// Code of s8 values (with K4N16 panels); reserved, a reader of this version answers "unsupported".
-pub const DTYPE_S8: u8 = 3;
-/// Code of panels of 16 outputs by 4 inputs; reserved like [`DTYPE_S8`].
-pub const LAYOUT_K4N16: u8 = 2;
-
 impl Dtype {
+    /// All types.
+    pub const ALL: [Dtype; 3] = [Dtype::F32, Dtype::F16, Dtype::Int8];
+
     /// Of a code.
     pub fn from_code(code: u8) -> Option<Dtype> {
-        [Dtype::F32, Dtype::F16].into_iter().find(|d| *d as u8 == code)
+        Dtype::ALL.into_iter().find(|d| *d as u8 == code)
     }
 
     /// Bytes of a value.
@@ -219,14 +221,16 @@ impl Dtype {
         match self {
             Dtype::F32 => 4,
             Dtype::F16 => 2,
+            Dtype::Int8 => 1,
         }
     }
 
-    /// `f32` or `f16`.
+    /// `f32`, `f16` or `int8`.
     pub fn name(self) -> &'static str {
         match self {
             Dtype::F32 => "f32",
             Dtype::F16 => "f16",
+            Dtype::Int8 => "int8",
         }
     }
 }
@@ -239,19 +243,30 @@ pub enum Layout {
     RowMajor = 0,
     /// Panels of 16 outputs, see [`crate::panel`].
     K1N16 = 1,
+    /// Panels of 16 outputs by four inputs, then scales, sums and signs, see [`crate::panel_s8`].
+    K4N16 = 2,
 }
 
 impl Layout {
+    /// All layouts.
+    pub const ALL: [Layout; 3] = [Layout::RowMajor, Layout::K1N16, Layout::K4N16];
+
     /// Of a code.
     pub fn from_code(code: u8) -> Option<Layout> {
-        [Layout::RowMajor, Layout::K1N16].into_iter().find(|l| *l as u8 == code)
+        Layout::ALL.into_iter().find(|l| *l as u8 == code)
     }
 
-    /// `RowMajor` or `K1N16`.
+    /// The layout in which matrices of a type are stored.
+    pub fn of_matrix(dtype: Dtype) -> Layout {
+        if dtype == Dtype::Int8 { Layout::K4N16 } else { Layout::K1N16 }
+    }
+
+    /// `RowMajor`, `K1N16` or `K4N16`.
     pub fn name(self) -> &'static str {
         match self {
             Layout::RowMajor => "RowMajor",
             Layout::K1N16 => "K1N16",
+            Layout::K4N16 => "K4N16",
         }
     }
 }

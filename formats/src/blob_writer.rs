@@ -11,7 +11,8 @@ use crate::config::{ModelConfig, Value};
 use crate::digest::{Digest, sha256};
 use crate::error::{Error, Result};
 use crate::meta::{self, Meta};
-use crate::panel::Order;
+use crate::panel::{LANES, Order};
+use crate::panel_s8::{self, Int8Layout};
 use half::f16;
 use half::slice::HalfFloatSliceExt;
 use sha2::{Digest as _, Sha256};
@@ -24,10 +25,23 @@ pub struct BlobWriter {
     sink: Sink,
     specs: Vec<TensorSpec>,
     head: Vec<u8>,
+    /// All metadata, the configuration's keys included.
+    pairs: BTreeMap<String, Value>,
     table: usize,
     data: u64,
     end: u64,
     written: usize,
+}
+
+/// A quantized matrix in the order of the blob, without padding of outputs.
+#[derive(Clone, Copy, Debug)]
+pub struct QuantizedMatrix<'a> {
+    /// Values in [-127, 127], `[n][k]`, k in the order of [`TensorSpec::matrix`].
+    pub values: &'a [i8],
+    /// One per output.
+    pub scales: &'a [f32],
+    /// One bit per rotated channel, 16 a word; empty without rotation.
+    pub signs: &'a [u16],
 }
 
 #[derive(Debug)]
@@ -51,21 +65,21 @@ impl Sink {
 impl BlobWriter {
     /// Starts a file.
     pub fn create(path: &Path, overwrite: Overwrite, config: &ModelConfig, meta: &Meta) -> Result<BlobWriter> {
-        let (specs, head, table) = plan(config, meta)?;
+        let plan = plan(config, meta)?;
         let file = AtomicFile::create(path, overwrite)?;
-        BlobWriter::start(Sink::File(file), specs, head, table)
+        BlobWriter::start(Sink::File(file), plan)
     }
 
     /// Starts a blob in memory, for [`BlobWriter::finish_bytes`].
     pub fn in_memory(config: &ModelConfig, meta: &Meta) -> Result<BlobWriter> {
-        let (specs, head, table) = plan(config, meta)?;
-        BlobWriter::start(Sink::Memory(Vec::new()), specs, head, table)
+        BlobWriter::start(Sink::Memory(Vec::new()), plan(config, meta)?)
     }
 
-    fn start(mut sink: Sink, specs: Vec<TensorSpec>, head: Vec<u8>, table: usize) -> Result<BlobWriter> {
+    fn start(mut sink: Sink, plan: Planned) -> Result<BlobWriter> {
+        let Planned { specs, pairs, head, table } = plan;
         sink.write(&head)?;
         let data = head.len() as u64;
-        Ok(BlobWriter { sink, specs, head, table, data, end: data, written: 0 })
+        Ok(BlobWriter { sink, specs, head, pairs, table, data, end: data, written: 0 })
     }
 
     /// The tensors the configuration asks for, in the order in which [`BlobWriter::write`] takes them.
@@ -78,14 +92,12 @@ impl BlobWriter {
     ///
     /// A value that is not finite in the stored type is an error; see [`fits_f16`].
     pub fn write(&mut self, values: &[f32], dtype: Dtype) -> Result<u64> {
-        let Some(spec) = self.specs.get(self.written) else {
-            return Err(Error::Internal("one tensor too many for the configuration".into()));
-        };
+        let at = self.next()?;
+        let spec = &self.specs[self.written];
         assert_eq!(values.len(), spec.len(), "values of {}", spec.name);
-        let at = layout::align(self.end, layout::TENSOR_ALIGN)
-            .ok_or_else(|| Error::Internal("blob length overflows".into()))?;
-        self.sink.write(&[0; layout::TENSOR_ALIGN as usize][..(at - self.end) as usize])?;
-
+        if dtype == Dtype::Int8 && spec.matrix().is_some() {
+            return Err(Error::Internal(format!("{} needs a quantizer", spec.name)));
+        }
         let mut out = Out { sink: &mut self.sink, hash: Sha256::new(), bytes: 0, name: &spec.name };
         let order = Order::of(spec);
         let (dtype, order_code) = match &order {
@@ -101,24 +113,102 @@ impl BlobWriter {
                     match dtype {
                         Dtype::F32 => out.f32s(&panel)?,
                         Dtype::F16 => out.f16s(&panel, &mut halves)?,
+                        Dtype::Int8 => unreachable!("refused above"),
                     }
                 }
                 (dtype, Layout::K1N16)
             }
         };
-        let (digest, bytes) = (out.hash.finalize(), out.bytes);
+        let (digest, bytes) = (out.hash.finalize().into(), out.bytes);
+        self.record((dtype, order_code, 0), (at, bytes), digest);
+        Ok(bytes)
+    }
+
+    /// Writes the next tensor, a matrix, as int8. Returns its bytes.
+    pub fn write_int8(&mut self, m: QuantizedMatrix) -> Result<u64> {
+        let at = self.next()?;
+        let spec = &self.specs[self.written];
+        let Some(s) = Int8Layout::of(spec, !m.signs.is_empty()) else {
+            return Err(Error::Internal(format!("{} {:?} cannot be int8", spec.name, spec.shape)));
+        };
+        assert!(m.values.len() == s.n * s.k && m.scales.len() == s.n, "values or scales of {}", spec.name);
+        assert_eq!(m.signs.len(), s.words, "sign words of {}", spec.name);
+        let limits = 1.0 / panel_s8::MAX_SCALE..=panel_s8::MAX_SCALE;
+        if let Some(o) = m.scales.iter().position(|v| !limits.contains(v)) {
+            return Err(Error::model(&spec.name, format!("the scale of output {o} is {:e}", m.scales[o])));
+        }
+        assert!(m.values.iter().all(|&v| v != i8::MIN), "-128 in {}", spec.name);
+
+        let mut out = Out { sink: &mut self.sink, hash: Sha256::new(), bytes: 0, name: &spec.name };
+        let mut panel = vec![0i8; s.panels() / (s.lanes() / LANES)];
+        let (mut scales, mut sums) = (vec![0.0f32; s.lanes()], vec![0i32; s.lanes()]);
+        scales[..s.n].copy_from_slice(m.scales);
+        for first in (0..s.n).step_by(LANES) {
+            panel.fill(0);
+            for o in first..(first + LANES).min(s.n) {
+                let row = &m.values[o * s.k..(o + 1) * s.k];
+                sums[o] = row.iter().map(|&v| i32::from(v)).sum();
+                for (i, &v) in row.iter().enumerate() {
+                    panel[s.place(o - first, i)] = v;
+                }
+            }
+            out.bytes(bytemuck::cast_slice(&panel))?;
+        }
+        out.bytes(bytemuck::cast_slice(&scales))?;
+        out.bytes(bytemuck::cast_slice(&sums))?;
+        out.bytes(bytemuck::cast_slice(m.signs))?;
+        let (digest, bytes) = (out.hash.finalize().into(), out.bytes);
+        assert_eq!(bytes, s.bytes() as u64, "bytes of {}", spec.name);
+        let block = if m.signs.is_empty() { 0 } else { panel_s8::rotation_block(LANES * s.words).unwrap_or(0) };
+        self.record((Dtype::Int8, Layout::K4N16, block), (at, bytes), digest);
+        Ok(bytes)
+    }
+
+    /// Pads to the place of the next tensor.
+    fn next(&mut self) -> Result<u64> {
+        if self.written == self.specs.len() {
+            return Err(Error::Internal("one tensor too many for the configuration".into()));
+        }
+        let at = layout::align(self.end, layout::TENSOR_ALIGN)
+            .ok_or_else(|| Error::Internal("blob length overflows".into()))?;
+        self.sink.write(&[0; layout::TENSOR_ALIGN as usize][..(at - self.end) as usize])?;
+        Ok(at)
+    }
+
+    /// Notes a tensor that has been written.
+    fn record(&mut self, (dtype, order, rotation): (Dtype, Layout, usize), (at, bytes): (u64, u64), digest: Digest) {
         let start = self.table + self.written * layout::RECORD;
         let row = &mut self.head[start..start + layout::RECORD];
         record::DTYPE.put_number(row, dtype as u64);
-        record::LAYOUT.put_number(row, order_code as u64);
+        record::LAYOUT.put_number(row, order as u64);
+        record::ROTATION.put_number(row, rotation as u64);
         record::OFFSET.put_number(row, at);
         record::LENGTH.put_number(row, bytes);
         record::DIGEST.put(row, &digest);
         self.end = at + bytes;
         self.written += 1;
-        Ok(bytes)
     }
 
+    /// Replaces the value of a metadata key by one of the same type and length: for what is known only when the
+    /// tensors are written.
+    pub fn replace(&mut self, key: &str, value: Value) -> Result<()> {
+        let mut meta = Meta::new();
+        meta.set(key, value.clone());
+        meta.check()?;
+        let old = meta::encode(&self.pairs);
+        match self.pairs.get_mut(key) {
+            Some(slot) if !key.starts_with(meta::CONFIG_PREFIX) => *slot = value,
+            _ => return Err(Error::Internal(format!("metadata {key} was not there from the start"))),
+        }
+        let new = meta::encode(&self.pairs);
+        if new.len() != old.len() {
+            return Err(Error::Internal(format!("metadata {key} changed its length")));
+        }
+        self.head[layout::HEADER..self.table].copy_from_slice(&new);
+        Ok(())
+    }
+
+    /// Lengths, root and digest into the header.
     fn complete(&mut self) -> Result<Digest> {
         if self.written != self.specs.len() {
             return Err(Error::Internal(format!("{} of {} tensors written", self.written, self.specs.len())));
@@ -135,21 +225,39 @@ impl BlobWriter {
         header::TENSOR_ROOT.put(head, &root.finalize());
         header::FILE_LENGTH.put_number(head, self.end);
         header::DATA_LENGTH.put_number(head, self.end - self.data);
+        header::HEADER_DIGEST.put(head, &[0; 32]);
         let digest = sha256(head);
         header::HEADER_DIGEST.put(head, &digest);
         Ok(digest)
     }
 
     /// Writes the header and makes the file visible; returns its digest ([`crate::blob::Blob::digest`]).
-    pub fn finish(mut self) -> Result<Digest> {
-        let digest = self.complete()?;
+    pub fn finish(self) -> Result<Digest> {
+        self.finish_checked(|_| Ok(Vec::new()))
+    }
+
+    /// [`BlobWriter::finish`] after a look at the whole file while it still has a temporary name. `check` gets its
+    /// path and may return metadata to replace ([`BlobWriter::replace`]); when it fails, nothing becomes visible.
+    pub fn finish_checked(mut self, check: impl FnOnce(&Path) -> Result<Vec<(String, Value)>>) -> Result<Digest> {
+        let mut digest = self.complete()?;
+        let Sink::File(file) = &mut self.sink else {
+            return Err(Error::Internal("a blob in memory ends with finish_bytes".into()));
+        };
+        file.write_at(0, &self.head)?;
+        let replaced = check(file.flushed()?)?;
+        if !replaced.is_empty() {
+            for (key, value) in replaced {
+                self.replace(&key, value)?;
+            }
+            digest = self.complete()?;
+        }
         match self.sink {
             Sink::File(mut file) => {
                 file.write_at(0, &self.head)?;
                 file.commit()?;
                 Ok(digest)
             }
-            Sink::Memory(_) => Err(Error::Internal("a blob in memory ends with finish_bytes".into())),
+            Sink::Memory(_) => unreachable!("refused above"),
         }
     }
 
@@ -170,6 +278,11 @@ impl BlobWriter {
 pub fn fits_f16(values: &[f32]) -> bool {
     // 65520 is halfway between 65504 and the next step, and rounds (to even) to infinity.
     values.iter().all(|v| v.abs() < 65520.0)
+}
+
+/// A value as it comes back from f16.
+pub fn through_f16(v: f32) -> f32 {
+    f16::from_f32(v).to_f32()
 }
 
 /// The bytes of one tensor on their way out.
@@ -204,7 +317,15 @@ impl Out<'_> {
 }
 
 /// The header section with every place known and every length and digest still zero.
-fn plan(config: &ModelConfig, meta: &Meta) -> Result<(Vec<TensorSpec>, Vec<u8>, usize)> {
+struct Planned {
+    specs: Vec<TensorSpec>,
+    pairs: BTreeMap<String, Value>,
+    head: Vec<u8>,
+    /// Start of the records.
+    table: usize,
+}
+
+fn plan(config: &ModelConfig, meta: &Meta) -> Result<Planned> {
     config.check("configuration")?;
     meta.check()?;
     let mut pairs: BTreeMap<String, Value> =
@@ -265,5 +386,5 @@ fn plan(config: &ModelConfig, meta: &Meta) -> Result<(Vec<TensorSpec>, Vec<u8>, 
         h[names_at + name_offset..][..spec.name.len()].copy_from_slice(spec.name.as_bytes());
         name_offset += spec.name.len();
     }
-    Ok((specs, head, table))
+    Ok(Planned { specs, pairs, head, table })
 }

@@ -97,6 +97,9 @@ pub enum Error {
         /// Expected and found.
         why: String,
     },
+    /// A check ran and did not pass ([`Status::CheckFailed`]).
+    #[error("{0}")]
+    CheckFailed(String),
     /// A bug of ours ([`Status::Internal`]).
     #[error("internal error: {0}")]
     Internal(String),
@@ -140,6 +143,7 @@ impl Error {
     /// The status this error maps to.
     pub fn status(&self) -> Status {
         match self {
+            Error::CheckFailed(_) => Status::CheckFailed,
             Error::Usage(_) => Status::Usage,
             Error::Input { .. } => Status::Input,
             Error::Model { .. } => Status::Model,

@@ -11,7 +11,7 @@
 //! | `blob_layout.rs` | every offset and limit of the format |
 //! | `blob_writer.rs` | [`BlobWriter`]: writes one, tensor by tensor |
 //! | `meta.rs` | [`Meta`]: typed metadata of a blob |
-//! | `panel.rs` | order of a matrix's weights in a blob |
+//! | `panel.rs`, `panel_s8.rs` | order of a matrix's weights in a blob: floats; int8 with scales, sums, signs |
 //! | `digest.rs` | SHA-256 |
 //! | `open.rs` | opening and reading regular files safely |
 //! | `map.rs` | the one memory mapping |
@@ -57,6 +57,7 @@ pub mod meta;
 pub mod npy;
 pub mod open;
 pub mod panel;
+pub mod panel_s8;
 pub mod picture;
 pub mod ply;
 pub mod poses_io;

@@ -24,8 +24,20 @@ pub mod keys {
     pub const COMMAND: &str = "converter.command";
     /// Licence text of the weights.
     pub const LICENCE: &str = "licence.text";
-    /// Requested precision: `f32` or `f16`.
+    /// Requested precision: `f32`, `f16` or `int8`.
     pub const PRECISION: &str = "precision";
+    /// SHA-256 of what the network predicts for a fixed clip, hexadecimal.
+    pub const GOLDEN: &str = "golden.digest";
+    /// Names of the measurements of [`CHECK_VALUES`], comma-separated.
+    pub const CHECK_KEYS: &str = "check.keys";
+    /// What the converter measured against the f32 model on clips; -1 where there was nothing to measure.
+    pub const CHECK_VALUES: &str = "check.values";
+    /// What the quantizer did, in words.
+    pub const QUANT_RECIPE: &str = "quant.recipe";
+    /// One line per matrix that is not int8: name, type, reason.
+    pub const QUANT_KEPT: &str = "quant.kept";
+    /// Signal to error of the stored weights in dB, one number per matrix in the order of the file.
+    pub const WEIGHT_SQNR: &str = "quant.weight_sqnr_db";
 }
 
 /// Prefix of the model configuration's keys inside the file.

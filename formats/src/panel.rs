@@ -46,6 +46,11 @@ impl Order {
         Some(Order { rows, columns })
     }
 
+    /// Place of value (output, input) in the checkpoint.
+    pub fn at(&self, o: usize, i: usize) -> usize {
+        self.rows[o] + self.columns[i]
+    }
+
     /// Number of panels.
     pub fn panels(&self) -> usize {
         self.rows.len().div_ceil(LANES)

@@ -3,15 +3,18 @@
 use sf_formats::arch;
 use sf_formats::atomic::Overwrite;
 use sf_formats::blob_layout::{self as layout, Field, header, record};
-use sf_formats::config::{Head, ModelConfig, Trunk};
+use sf_formats::blob_writer::QuantizedMatrix;
+use sf_formats::config::{Head, ModelConfig, Trunk, Value};
 use sf_formats::digest::sha256;
-use sf_formats::{Blob, BlobWriter, Dtype, LoadMode, Meta, Verify};
+use sf_formats::panel_s8::{rotated_width, rotation_block};
+use sf_formats::{Blob, BlobWriter, Dtype, Layout, LoadMode, Meta, Verify};
 use std::path::Path;
 
-/// The cases covered here; int8 scales and memory plans (b20, b21, b22, b26) are not in the format.
-pub const CASES: [&str; 31] = [
+/// The cases covered here; memory plans (b26) are not in the format.
+pub const CASES: [&str; 34] = [
     "b01", "b02", "b03", "b04", "b05", "b06", "b07", "b08", "b09", "b10", "b11", "b12", "b13", "b14", "b15", "b16",
-    "b17", "b18", "b19", "b23", "b24", "b25", "b27", "b28", "b29", "b30", "b31", "b32", "b33", "b34", "b36",
+    "b17", "b18", "b19", "b20", "b21", "b22", "b23", "b24", "b25", "b27", "b28", "b29", "b30", "b31", "b32", "b33",
+    "b34", "b36",
 ];
 
 #[test]
@@ -357,8 +360,8 @@ fn b06_text_mode_damage() {
 
 #[test]
 fn b07_other_major_versions() {
-    Forge::new().set(header::MAJOR, 2).refused(7, "version 2.0, this program reads 1.x: use a newer program");
-    Forge::new().set(header::MAJOR, 0).refused(7, "version 0.0, this program reads 1.x: convert");
+    Forge::new().set(header::MAJOR, 2).refused(7, "version 2.1, this program reads 1.x: use a newer program");
+    Forge::new().set(header::MAJOR, 0).refused(7, "version 0.1, this program reads 1.x: convert");
     // A newer minor version is compatible.
     let minor = Forge::new().set(header::MINOR, 9).stamp();
     Blob::from_bytes(&minor.0).unwrap();
@@ -486,13 +489,150 @@ fn b17_names_with_bad_characters() {
 fn b18_unknown_types_and_feature_bits() {
     let f = Forge::new();
     f.clone().set_in(2, record::DTYPE, 9).stamp().refused(7, "type 9");
-    f.clone().set_in(2, record::DTYPE, u64::from(layout::DTYPE_S8)).stamp().refused(7, "reserved");
     f.clone().set_in(2, record::LAYOUT, 7).stamp().refused(7, "layout 7");
     f.clone().set(header::REQUIRED, 1 << 40).refused(7, "0x10000000000");
     f.clone().set(header::DIGEST_KIND, 2).refused(7, "digest algorithm 2");
     // Optional features may be ignored.
     let optional = f.set(header::OPTIONAL, u64::MAX).stamp();
     Blob::from_bytes(&optional.0).unwrap();
+}
+
+/// A blob with int8 matrices wherever they can be, rotated where the width allows; two of them are
+/// `camera_head.fc_rot.weight` `[9, 32]` and `point_head.proj.weight` `[3, 20]`.
+fn int8_blob() -> Vec<u8> {
+    let trunk = Trunk { dim: 32, ..tiny().encoder };
+    let config = ModelConfig {
+        encoder: trunk.clone(),
+        aa: Trunk { depth: 2, ..trunk },
+        camera_width: 32,
+        depth: Head::xdec_linear(3, 20, 0, 1),
+        ..tiny()
+    };
+    let mut w = BlobWriter::in_memory(&config, &Meta::new()).unwrap();
+    for (i, spec) in w.specs().to_vec().iter().enumerate() {
+        let Some((n, k)) = spec.matrix() else {
+            w.write(&values(spec.len(), i), Dtype::F32).unwrap();
+            continue;
+        };
+        let bytes: Vec<i8> = (0..n * k).map(|v| ((v * 7 + i) % 255) as i8).map(|v| v.max(-127)).collect();
+        let scales: Vec<f32> = (0..n).map(|o| 0.25 * (o + 1) as f32).collect();
+        let width = rotated_width(spec).unwrap();
+        let signs = vec![0x1234; if rotation_block(width).is_some() { width / 16 } else { 0 }];
+        w.write_int8(QuantizedMatrix { values: &bytes, scales: &scales, signs: &signs }).unwrap();
+    }
+    w.finish_bytes().unwrap()
+}
+
+#[test]
+fn int8_matrices_are_read_as_written() {
+    let bytes = int8_blob();
+    let blob = Blob::from_bytes(&bytes).unwrap();
+    let i = blob.find("camera_head.fc_rot.weight").unwrap();
+    let (t, m) = (&blob.tensors()[i], blob.int8(i));
+    assert_eq!((t.dtype, t.layout, t.rotation), (Dtype::Int8, Layout::K4N16, 32));
+    assert_eq!((m.layout.n, m.layout.k, m.data.len(), m.signs), (9, 32, 16 * 32, &[0x1234, 0x1234][..]));
+    assert_eq!((m.scales[8], m.sums.len()), (2.25, 9));
+    let stored = |o: usize, k: usize| m.data[m.layout.place(o, k)];
+    assert_eq!(stored(0, 1), stored(0, 0).wrapping_add(7));
+    let mut out = Vec::new();
+    blob.read_f32(i, &mut out);
+    // A rotation keeps the length of every row.
+    for o in 0..9 {
+        let want: f64 = (0..32).map(|k| (f64::from(stored(o, k)) * f64::from(m.scales[o])).powi(2)).sum();
+        let have: f64 = out[o * 32..(o + 1) * 32].iter().map(|&v| f64::from(v).powi(2)).sum();
+        assert!((have / want - 1.0).abs() < 1e-6);
+    }
+    // Without rotation the values themselves.
+    let i = blob.find("point_head.proj.weight").unwrap();
+    let m = blob.int8(i);
+    assert_eq!((blob.tensors()[i].rotation, m.signs.len()), (0, 0));
+    blob.read_f32(i, &mut out);
+    assert_eq!(out[2 * 20 + 5], f32::from(m.data[m.layout.place(2, 5)]) * 0.75);
+}
+
+/// Bytes of the int8 matrix `[9, 32]`: panels, scales, sums, signs.
+const INT8: [usize; 4] = [0, 16 * 32, 16 * 32 + 64, 16 * 32 + 128];
+
+fn int8_matrix() -> (Forge, usize) {
+    let f = Forge(int8_blob());
+    let at = f.get_in(f.find("camera_head.fc_rot.weight"), record::OFFSET) as usize;
+    (f, at)
+}
+
+#[test]
+fn b20_scales_out_of_range() {
+    let (f, at) = int8_matrix();
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 0.0, -0.0, -1.0, 1e-40, 8e-19, 1.3e18] {
+        let f = f.clone().put(at + INT8[1] + 4 * 7, &bad.to_le_bytes()).stamp();
+        f.refused(4, "camera_head.fc_rot.weight: the scale of output 7 is ");
+    }
+    for good in [1e-18f32, 1.1e18] {
+        Blob::from_bytes(&f.clone().put(at + INT8[1], &good.to_le_bytes()).stamp().0).unwrap();
+    }
+    f.put(at + INT8[1] + 4 * 9, &1.0f32.to_le_bytes()).stamp().refused(4, "scales or sums of unused outputs");
+}
+
+#[test]
+fn b21_a_byte_of_minus_128() {
+    let (f, at) = int8_matrix();
+    f.put(at + 70, &[0x80]).stamp().refused(4, "camera_head.fc_rot.weight: byte 70 is -128");
+}
+
+#[test]
+fn b22_sums_that_are_not_the_sums() {
+    let (f, at) = int8_matrix();
+    let sum = i32::from_le_bytes(f.0[at + INT8[2] + 12..][..4].try_into().unwrap());
+    let bad = f.clone().put(at + INT8[2] + 12, &(sum + 1).to_le_bytes()).stamp();
+    bad.refused(4, "camera_head.fc_rot.weight: the stored sum of output 3 is ");
+    // A changed weight under right digests shows here, too.
+    let byte = f.0[at + 4];
+    f.clone().put(at + 4, &[byte ^ 1]).stamp().refused(4, "the stored sum of output 1 is ");
+    // Padding of outputs, with the sums left right.
+    f.put(at + 4 * 9, &[1]).stamp().refused(4, "values beyond its 9 outputs or 32 inputs are not zero");
+}
+
+#[test]
+fn int8_extents_and_rotations_are_checked() {
+    let (f, _) = int8_matrix();
+    let i = f.find("camera_head.fc_rot.weight");
+    for block in [16, 64, 128, 1, u64::from(u32::MAX)] {
+        f.clone().set_in(i, record::ROTATION, block).stamp().refused(4, "a rotation by blocks of");
+    }
+    // Without rotation there are no signs: four bytes too many.
+    f.clone().set_in(i, record::ROTATION, 0).stamp().refused(4, "as K4N16 int8 is not 644 bytes");
+    let narrow = f.find("point_head.proj.weight");
+    f.clone().set_in(narrow, record::ROTATION, 16).stamp().refused(4, "a rotation by blocks of 16 does not fit");
+    let vector = f.find("encoder.norm.bias");
+    f.clone().set_in(vector, record::ROTATION, 32).stamp().refused(4, "a rotation by blocks of 32 does not fit");
+    f.clone().set_in(i, record::LAYOUT, 1).stamp().refused(4, "stored as K1N16 int8");
+    f.set_in(i, record::DTYPE, 2).stamp().refused(4, "camera_head.fc_rot.weight");
+}
+
+/// What only becomes known while tensors are written is put in its place at the end; a check that fails leaves no file.
+#[test]
+fn late_metadata_and_checks() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("m.sfw");
+    let mut meta = Meta::new();
+    meta.set("late.reals", Value::Floats(vec![0.0; 2]));
+    let start = |overwrite| BlobWriter::create(&path, overwrite, &tiny(), &meta).unwrap();
+    let late = |v: &[f64]| ("late.reals".to_string(), Value::Floats(v.to_vec()));
+    let look = |temp: &Path| {
+        let seen = Blob::open(temp, LoadMode::Map, Verify::Digests)?;
+        assert_eq!(seen.meta().get("late.reals"), Some(&Value::Floats(vec![0.0; 2])));
+        assert!(!path.exists());
+        Ok(vec![late(&[1.5, 2.5])])
+    };
+    let digest = fill(start(Overwrite::No)).finish_checked(look).unwrap();
+    let blob = Blob::open(&path, LoadMode::Map, Verify::Digests).unwrap();
+    assert_eq!((blob.digest(), blob.meta().get("late.reals")), (&digest, Some(&late(&[1.5, 2.5]).1)));
+    std::fs::remove_file(&path).unwrap();
+    let e = fill(start(Overwrite::No)).finish_checked(|_| Err(sf_formats::Error::usage("no"))).unwrap_err();
+    assert_eq!((e.status() as i32, std::fs::read_dir(dir.path()).unwrap().count()), (2, 0));
+    let mut w = start(Overwrite::No);
+    assert!(w.replace("late.reals", Value::Floats(vec![0.0; 3])).is_err());
+    assert!(w.replace("other", Value::Int(0)).is_err());
+    assert!(w.replace("config.mask.k", Value::Int(2)).is_err());
 }
 
 #[test]

@@ -56,17 +56,26 @@ fn constants_are_the_documented_ones() {
     assert!(cell(&h, "data_offset").ends_with(&format!("rounded up to {}", layout::DATA_ALIGN)));
 
     let r = rows("Tensor records");
-    let dtypes = [Dtype::F32, Dtype::F16].map(|d| format!("{} {}", d as u8, d.name())).join(", ");
-    assert_eq!(cell(&r, "dtype"), format!("{dtypes}; {} is reserved for s8", layout::DTYPE_S8));
-    let orders = [Layout::RowMajor, Layout::K1N16].map(|l| format!("{} {}", l as u8, l.name())).join(", ");
-    assert_eq!(cell(&r, "layout"), format!("{orders}; {} is reserved for K4N16", layout::LAYOUT_K4N16));
+    assert_eq!(cell(&r, "dtype"), Dtype::ALL.map(|d| format!("{} {}", d as u8, d.name())).join(", "));
+    assert_eq!(cell(&r, "layout"), Layout::ALL.map(|l| format!("{} {}", l as u8, l.name())).join(", "));
     assert_eq!(cell(&r, "rank"), format!("1 to {}", layout::MAX_RANK));
     assert!(cell(&r, "dims").contains(&format!("1 to 2^{};", layout::MAX_DIM.ilog2())));
     assert!(cell(&r, "name_length").starts_with(&format!("1 to {};", layout::MAX_NAME)));
     assert!(cell(&r, "offset").ends_with(&format!("a multiple of {}", layout::TENSOR_ALIGN)));
 
     let m = rows("Metadata");
-    for key in [keys::SOURCE_DIGEST, keys::SOURCE, keys::CONVERTER, keys::COMMAND, keys::LICENCE, keys::PRECISION] {
+    for key in [
+        keys::SOURCE_DIGEST,
+        keys::SOURCE,
+        keys::CONVERTER,
+        keys::COMMAND,
+        keys::LICENCE,
+        keys::PRECISION,
+        keys::GOLDEN,
+        keys::QUANT_RECIPE,
+        keys::QUANT_KEPT,
+        keys::WEIGHT_SQNR,
+    ] {
         assert!(!cell(&m, key).is_empty());
     }
 

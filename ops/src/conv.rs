@@ -13,6 +13,7 @@ use crate::gemm::{
     Act, AddTo, KC, MAX_NV, NR, PanelData, Panels, Product, RowSink, Rows, Sink, Source, per_column, product,
 };
 use crate::mat::{Hwc, HwcMut};
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 
 /// A convolution layer.
@@ -247,6 +248,7 @@ pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut)
     }
     let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
     let (bias, act) = (conv.bias, conv.act);
+    let _span = opclock::span(Op::Conv, || Work::product(oh * ow, &weight, x.h * x.w * x.c));
     product(ctx, &Product { m: oh * ow, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }
 
@@ -290,6 +292,7 @@ pub fn conv_transpose(ctx: Ctx, x: Hwc, conv: &ConvTranspose, out: HwcMut) {
     assert!(bias.is_none_or(|b| b.len() == out.c), "bias of {} outputs", out.c);
     let (m, act) = (x.h * x.w, Act::None);
     let source = Rows(x.as_mat());
+    let _span = opclock::span(Op::Conv, || Work::product(m, &weight, m * x.c));
     let sink = Scatter { w: x.w, kernel, line: kernel * out.c, out: SharedMut::new(out.data) };
     product(ctx, &Product { m, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }

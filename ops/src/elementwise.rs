@@ -3,12 +3,14 @@
 use crate::activation::Map;
 use crate::cpu::Ctx;
 use crate::mat::{Hwc, HwcMut, Mat};
+use crate::opclock::{self, Op, Work};
 use crate::simd::{LANES, Simd, Vector, padded};
 
 /// Values of one task: 64 KiB, so that a region pays for its microsecond.
 const TASK: usize = 1 << 14;
 
 fn map(ctx: Ctx, op: Map, x: &mut [f32]) {
+    let _span = opclock::span(Op::Elementwise, || Work::values(x.len()));
     ctx.pool.chunks(x, TASK, &|_, piece, _| ctx.kernels.map(op, piece));
 }
 
@@ -50,6 +52,7 @@ pub(crate) fn add_body<S: Simd>(s: S, x: &mut [f32], y: &[f32]) {
 /// out = x + y.
 pub fn add(ctx: Ctx, x: &[f32], y: &[f32], out: &mut [f32]) {
     assert!(x.len() == y.len() && x.len() == out.len(), "{} + {} -> {} values", x.len(), y.len(), out.len());
+    let _span = opclock::span(Op::Elementwise, || Work::values(3 * x.len() / 2));
     ctx.pool.chunks(out, TASK, &|i, piece, _| {
         piece.copy_from_slice(&x[i * TASK..][..piece.len()]);
         ctx.kernels.add(piece, &y[i * TASK..][..piece.len()]);
@@ -59,6 +62,7 @@ pub fn add(ctx: Ctx, x: &[f32], y: &[f32], out: &mut [f32]) {
 /// x = x + y.
 pub fn add_assign(ctx: Ctx, x: &mut [f32], y: &[f32]) {
     assert_eq!(x.len(), y.len(), "lengths of a sum");
+    let _span = opclock::span(Op::Elementwise, || Work::values(3 * x.len() / 2));
     ctx.pool.chunks(x, TASK, &|i, piece, _| ctx.kernels.add(piece, &y[i * TASK..][..piece.len()]));
 }
 
@@ -82,6 +86,7 @@ pub fn pixel_shuffle_beside(ctx: Ctx, x: Mat, grid: (usize, usize), p: usize, be
     if line == 0 {
         return;
     }
+    let _span = opclock::span(Op::Resize, || Work::values(out.data.len()));
     // One task per output line.
     ctx.pool.chunks(out.data, line, &|oy, piece, _| {
         for (px, patch) in piece.chunks_exact_mut(p * all).enumerate() {

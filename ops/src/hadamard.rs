@@ -11,6 +11,7 @@
 
 use crate::cpu::Ctx;
 use crate::mat::MatMut;
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector};
 
@@ -121,6 +122,7 @@ pub fn rotate_rows(ctx: Ctx, rotation: Rotation, x: MatMut) {
     let (rows, cols, stride) = (x.rows, x.cols, x.stride);
     assert_eq!(cols, rotation.width, "width of a rotation");
     let c = rotation.normalizer();
+    let _span = opclock::span(Op::Quantize, || Work::values(rows * cols));
     let per_task = (TASK / cols).max(1);
     let shared = SharedMut::new(x.data);
     ctx.pool.run(rows.div_ceil(per_task), &|task, _| {

@@ -5,6 +5,7 @@
 
 use crate::cpu::Ctx;
 use crate::mat::{Mat, MatMut};
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector, fold_add, padded};
 
@@ -87,6 +88,7 @@ pub fn layernorm(ctx: Ctx, x: Mat, gain: &[f32], offset: &[f32], eps: f32, out: 
     if cols == 0 {
         return;
     }
+    let _span = opclock::span(Op::Norm, || Work::values(rows * cols));
     let per_task = (TASK / cols).max(1);
     let stride = out.stride;
     let shared = SharedMut::new(out.data);

@@ -17,6 +17,7 @@
 //! | `resize.rs` | bilinear maps, Pillow's 8-bit resize, position tables |
 //! | `trig.rs` | f64 sin, cos, exp, ln for tables |
 //! | `prefetch.rs` | the hint to fetch a cache line |
+//! | `opclock.rs` | time and work of the operations by kind, for profiles |
 //! | `peak.rs` | the arithmetic peak of one core, for `doctor` and `bench` |
 //! | `reference.rs` | the definition of every op in plain loops |
 //!
@@ -35,6 +36,7 @@ pub mod gemm;
 pub mod hadamard;
 pub mod layernorm;
 pub mod mat;
+pub mod opclock;
 pub mod par;
 pub mod peak;
 pub mod prefetch;

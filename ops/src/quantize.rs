@@ -13,6 +13,7 @@ use crate::gemm::s8::pack::{QUAD, RowsS8Mut, padded_k};
 use crate::hadamard::{Rotation, rotate};
 use crate::layernorm::{NormRow, moments, norm_row};
 use crate::mat::Mat;
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector, padded};
 
@@ -347,6 +348,7 @@ pub fn quantize(ctx: Ctx, x: Mat, before: Before, out: RowsS8Mut) {
         out.scales.fill(0.0);
         return;
     }
+    let _span = opclock::span(Op::Quantize, || Work { macs: 0, bytes: (5 * rows * cols) as u64 });
     let per_task = (TASK / cols).max(1);
     let (bytes, scales) = (SharedMut::new(out.data), SharedMut::new(out.scales));
     ctx.pool.reserve_scratch(cols);

@@ -2,6 +2,7 @@
 
 use crate::cpu::Ctx;
 use crate::mat::{Hwc, HwcMut};
+use crate::opclock::{self, Op, Work};
 use crate::simd::{LANES, Simd, Vector, padded};
 
 /// Which points of the two grids coincide.
@@ -80,6 +81,7 @@ pub fn bilinear(ctx: Ctx, x: Hwc, corners: Corners, out: HwcMut) {
         return;
     }
     assert!(x.h > 0 && x.w > 0, "resize of an empty {} x {} image", x.h, x.w);
+    let _span = opclock::span(Op::Resize, || Work::values((x.h * x.w * c + oh * line) / 2));
     ctx.pool.chunks(out.data, line, &|oy, piece, _| {
         let (y0, y1, fy) = source(oy, x.h, oh, corners);
         let at = |y: usize| &x.data[y * x.w * c..][..x.w * c];

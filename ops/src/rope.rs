@@ -9,6 +9,7 @@
 use crate::cpu::Ctx;
 use crate::layernorm::moments;
 use crate::mat::MatMut;
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::simd::{LANES, Simd, Vector, padded};
 use crate::trig;
@@ -201,6 +202,7 @@ pub fn qk_norm_rope(ctx: Ctx, qkv: MatMut, heads: usize, norm: Option<QkNorm>, r
     if d == 0 || norm.is_none() && rope.is_none() {
         return;
     }
+    let _span = opclock::span(Op::Norm, || Work::values(rows * 2 * heads * d));
     let shared = SharedMut::new(data);
     ctx.pool.run(rows.div_ceil(TASK_ROWS), &|task, _| {
         for r in task * TASK_ROWS..((task + 1) * TASK_ROWS).min(rows) {

@@ -1,19 +1,20 @@
 //! Checkpoint to weight blob, one tensor in memory at a time.
 //!
-//! Matrices become f32 or f16 panels, everything else f32. At f16 these stay f32: the camera head and
-//! the output layer of every head (the log depth goes through an exponential, poses and velocities are
-//! small numbers; together under 0.3 % of the weights), matrices with a value beyond the range of f16,
-//! and what the caller keeps.
+//! Matrices become f32, f16 or int8 panels, everything else f32. Which matrix gets which type is decided in
+//! [`crate::recipe`]; a matrix with a value beyond the range of f16 becomes f32 instead, and one whose int8 weights
+//! do not reach [`WEIGHT_FLOOR_DB`] becomes f16.
 
 use crate::detect::detect;
 use crate::names::{Names, WRAPPERS, nearest, resolve};
+use crate::quantize::{self, EXACT_DB, Fold, Quantized, sqnr_db};
+use crate::recipe::{self, Folding, Sources};
 use crate::report::{Origin, Report, TensorReport, first_five};
-use crate::seeded::{CONFIG_KEY, Outputs, Seeded, output_layer};
+use crate::seeded::{CONFIG_KEY, Outputs, Seeded};
 use sf_formats::arch::{self, Role, TensorSpec};
 use sf_formats::atomic::{AtomicFile, Overwrite};
-use sf_formats::blob_writer::{BlobWriter, fits_f16};
+use sf_formats::blob_writer::{BlobWriter, QuantizedMatrix, fits_f16, through_f16};
 use sf_formats::checkpoint::{self, Checkpoint};
-use sf_formats::config::ModelConfig;
+use sf_formats::config::{ModelConfig, Value};
 use sf_formats::digest::hex;
 use sf_formats::error::{escape, escape_path};
 use sf_formats::meta::{Meta, keys};
@@ -28,8 +29,14 @@ use std::sync::mpsc::sync_channel;
 pub struct Options {
     /// Type of the matrices.
     pub precision: Dtype,
-    /// Exceptions by prefix of the name, first match wins; they concern matrices.
+    /// Exceptions by the start of the name (`*` and `?` as wildcards), first match wins; they concern matrices.
     pub keep: Vec<(String, Dtype)>,
+    /// Names of matrices that int8 is too coarse for: stored as f16.
+    pub promoted: Vec<String>,
+    /// Whether the blob gets a place for the digest of a golden run ([`keys::GOLDEN`]), which the caller fills in.
+    pub golden: bool,
+    /// Names of measurements for which the blob gets places ([`keys::CHECK_VALUES`]), which the caller fills in.
+    pub checks: Vec<String>,
     /// Configuration for a checkpoint that carries none.
     pub config: Option<ModelConfig>,
     /// Prefixes of tensors that may be missing; they start neutral.
@@ -46,6 +53,9 @@ impl Options {
         Options {
             precision,
             keep: Vec::new(),
+            promoted: Vec::new(),
+            golden: false,
+            checks: Vec::new(),
             config: None,
             allow_missing: Vec::new(),
             licence: None,
@@ -54,14 +64,30 @@ impl Options {
     }
 }
 
-/// Reads an exception of the form `PREFIX=f16` or `PREFIX=f32`.
+/// int8 weights below this signal-to-error ratio are stored as f16: some row is dominated by few huge values.
+pub const WEIGHT_FLOOR_DB: f64 = 30.0;
+
+/// Reason of a matrix of [`Options::promoted`].
+pub const SCAN_REASON: &str = "sensitivity scan";
+
+/// Where no golden run has been made.
+pub const NO_DIGEST: &str = "0000000000000000000000000000000000000000000000000000000000000000";
+
+/// What the quantizer does, for the blob's provenance.
+const RECIPE: &str = "weights: symmetric int8 per output, least-squares step, rotated by a random-sign block Hadamard; norms \
+    and layer scales folded in; activations: symmetric int8 per token, at run time";
+
+/// Reads an exception of the form `PATTERN=f16`, `PATTERN=f32` or `PATTERN=int8`.
 pub fn parse_keep(text: &str) -> Result<(String, Dtype)> {
     let parsed = text.rsplit_once('=').and_then(|(prefix, name)| {
-        let dtype = [Dtype::F32, Dtype::F16].into_iter().find(|d| d.name() == name)?;
+        let dtype = Dtype::ALL.into_iter().find(|d| d.name() == name)?;
         (!prefix.is_empty()).then(|| (prefix.to_string(), dtype))
     });
     parsed.ok_or_else(|| {
-        Error::usage(format!("'{}' is not of the form PREFIX=f16 or PREFIX=f32", escape(text.as_bytes())))
+        Error::usage(format!(
+            "'{}' is not of the form PATTERN=f32, PATTERN=f16 or PATTERN=int8",
+            escape(text.as_bytes())
+        ))
     })
 }
 
@@ -77,13 +103,13 @@ pub fn plan_files(inputs: &[PathBuf], options: &Options) -> Result<Report> {
 
 /// Converts an open checkpoint to a blob.
 pub fn convert(source: &dyn Checkpoint, output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
-    convert_at(source, &source.describe(), (output, overwrite), options)
+    convert_at(source, &source.describe(), (output, overwrite), options, unchecked)
 }
 
 /// Converts files to a blob. The output must not be one of the inputs, nor a checkpoint.
 pub fn convert_files(inputs: &[PathBuf], output: &Path, overwrite: Overwrite, options: &Options) -> Result<Report> {
     refuse_own_input(inputs, output)?;
-    convert_at(checkpoint::open(inputs)?.as_ref(), &place(inputs), (output, overwrite), options)
+    convert_at(checkpoint::open(inputs)?.as_ref(), &place(inputs), (output, overwrite), options, unchecked)
 }
 
 /// Converts an open checkpoint to the bytes of a blob, for networks that fit into memory.
@@ -96,12 +122,30 @@ pub fn convert_to_bytes(source: &dyn Checkpoint, options: &Options) -> Result<Ve
     writer.finish_bytes()
 }
 
+/// [`convert()`] with a look at the whole blob before it becomes visible: `check` gets its temporary path and the
+/// report so far, and may return metadata to fill in. When it fails, there is no blob.
+pub fn convert_checked(
+    source: &dyn Checkpoint,
+    output: &Path,
+    overwrite: Overwrite,
+    options: &Options,
+    check: impl FnOnce(&Path, &Report) -> Result<Vec<(String, Value)>>,
+) -> Result<Report> {
+    convert_at(source, &source.describe(), (output, overwrite), options, check)
+}
+
+/// Nothing to look at.
+fn unchecked(_: &Path, _: &Report) -> Result<Vec<(String, Value)>> {
+    Ok(Vec::new())
+}
+
 /// `at`: what messages call the source.
 fn convert_at(
     source: &dyn Checkpoint,
     at: &str,
     (output, overwrite): (&Path, Overwrite),
     options: &Options,
+    check: impl FnOnce(&Path, &Report) -> Result<Vec<(String, Value)>>,
 ) -> Result<Report> {
     let (mut report, jobs) = prepare(source, at, options)?;
     // An output that cannot be written is better known before gigabytes are hashed.
@@ -109,7 +153,8 @@ fn convert_at(
     let meta = provenance(source, options, &mut report)?;
     let mut writer = BlobWriter::create(output, overwrite, &report.config, &meta)?;
     stream((source, at), &jobs, &mut writer, &mut report)?;
-    report.blob_digest = Some(writer.finish()?);
+    let digest = writer.finish_checked(|path| check(path, &report))?;
+    report.blob_digest = Some(digest);
     Ok(report)
 }
 
@@ -151,6 +196,27 @@ struct Job {
     /// Index in the checkpoint, or in the neutral network.
     from: (Origin, usize),
     dtype: Dtype,
+    fate: Fate,
+}
+
+/// What happens to a tensor's values.
+enum Fate {
+    /// Stored as they are.
+    Plain,
+    /// Folded into others: stored as ones or zeros.
+    Neutral(f32),
+    /// A matrix that takes vectors in; where those come from.
+    Folded(Vec<(Part, (Origin, usize))>),
+    /// The bias of the matrix before, folded with it.
+    FoldedBias,
+}
+
+/// Which vector of a [`Fold`].
+#[derive(Clone, Copy)]
+enum Part {
+    Gain,
+    Offset,
+    Gamma,
 }
 
 /// Names, configuration, the exact set of tensors, types: everything but values.
@@ -177,28 +243,34 @@ fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Repo
     let from = check_set((source, at), (&names, &surplus), &specs, options)?;
 
     let mut used = vec![false; options.keep.len()];
-    let (mut jobs, mut tensors) = (Vec::new(), Vec::new());
-    for (spec, from) in specs.into_iter().zip(from) {
-        let kept = options.keep.iter().position(|(prefix, _)| spec.name.starts_with(prefix.as_str()));
+    let mut choices = Vec::new();
+    for spec in &specs {
+        let kept = options.keep.iter().position(|(pattern, _)| recipe::names(pattern, &spec.name));
         if let Some(k) = kept {
             used[k] = true;
         }
-        let dtype = match (spec.matrix(), kept) {
-            (None, _) => Dtype::F32,
-            (Some(_), Some(k)) => options.keep[k].1,
-            (Some(_), None) if is_sensitive(&config, &spec.name) => Dtype::F32,
-            (Some(_), None) => options.precision,
-        };
+        choices.push(recipe::choose(
+            &config,
+            spec,
+            options.precision,
+            (kept.map(|k| &options.keep[k]), options.promoted.contains(&spec.name)),
+        ));
+    }
+    let folding = recipe::fold(&specs, &choices);
+    let (mut jobs, mut tensors) = (Vec::new(), Vec::new());
+    for (i, spec) in specs.into_iter().enumerate() {
         tensors.push(TensorReport {
             name: spec.name.clone(),
             shape: spec.shape.clone(),
-            origin: from.0,
-            dtype,
+            origin: from[i].0,
+            dtype: choices[i].dtype,
             bytes: 0,
             promoted: false,
             zero_outputs: 0,
+            sqnr_db: None,
+            reason: choices[i].reason.clone(),
         });
-        jobs.push(Job { spec, from, dtype });
+        jobs.push(Job { spec, from: from[i], dtype: choices[i].dtype, fate: fate(&folding, &from, i) });
     }
     if let Some(k) = used.iter().position(|u| !u) {
         let (prefix, dtype) = &options.keep[k];
@@ -224,9 +296,21 @@ fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Repo
     Ok((report, jobs))
 }
 
-/// Whether a matrix stays f32 by default.
-fn is_sensitive(config: &ModelConfig, name: &str) -> bool {
-    name.starts_with("camera_head.") || output_layer(config, name).is_some()
+/// What the folding does to tensor `i`.
+fn fate(folding: &Folding, from: &[(Origin, usize)], i: usize) -> Fate {
+    if let Some(&value) = folding.neutral.get(&i) {
+        return Fate::Neutral(value);
+    }
+    if folding.bias_of.contains_key(&i) {
+        return Fate::FoldedBias;
+    }
+    match folding.into.get(&i) {
+        Some(Sources { gain, offset, gamma }) => {
+            let parts = [(Part::Gain, gain), (Part::Offset, offset), (Part::Gamma, gamma)];
+            Fate::Folded(parts.into_iter().filter_map(|(part, at)| at.map(|at| (part, from[at]))).collect())
+        }
+        None => Fate::Plain,
+    }
 }
 
 /// The checkpoint's own configuration, else the caller's, else what names and shapes say.
@@ -376,10 +460,31 @@ fn provenance(source: &dyn Checkpoint, options: &Options, report: &mut Report) -
     if let Some(licence) = &report.licence {
         meta.set_text(keys::LICENCE, licence);
     }
+    if options.golden {
+        meta.set_text(keys::GOLDEN, NO_DIGEST);
+    }
+    if !options.checks.is_empty() {
+        meta.set_text(keys::CHECK_KEYS, &options.checks.join(","));
+        meta.set(keys::CHECK_VALUES, Value::Floats(vec![0.0; options.checks.len()]));
+    }
+    if options.precision == Dtype::Int8 {
+        meta.set_text(keys::QUANT_RECIPE, RECIPE);
+        let kept = report.tensors.iter().filter_map(|t| t.reason.as_ref().map(|why| (t, why)));
+        let lines: Vec<String> = kept.map(|(t, why)| format!("{} {} {why}", t.name, t.dtype.name())).collect();
+        meta.set_text(keys::QUANT_KEPT, &lines.join("\n"));
+        let matrices = arch::tensors(&report.config).iter().filter(|s| s.matrix().is_some()).count();
+        meta.set(keys::WEIGHT_SQNR, Value::Floats(vec![0.0; matrices]));
+    }
     Ok(meta)
 }
 
-/// Reads on one thread, packs and writes on the other; at most two tensors are in memory.
+/// Values of one tensor, and what is folded into it.
+struct Loaded {
+    values: Vec<f32>,
+    fold: Fold,
+}
+
+/// Reads on one thread, quantizes, packs and writes on the others; at most three tensors are in memory.
 fn stream(
     (source, at): (&dyn Checkpoint, &str),
     jobs: &[Job],
@@ -388,12 +493,13 @@ fn stream(
 ) -> Result<()> {
     let neutral = Seeded::new(&report.config, 0, Outputs::Neutral)?;
     let neutral = &neutral;
+    let int8 = report.precision == Dtype::Int8;
     std::thread::scope(|scope| {
         // A rendezvous: the reader is one tensor ahead. It ends when the writer hangs up.
-        let (send, receive) = sync_channel::<Result<Vec<f32>>>(0);
+        let (send, receive) = sync_channel::<Result<Loaded>>(0);
         let read = move || {
             for job in jobs {
-                let values = load((source, at), neutral, job);
+                let values = load_with_parts((source, at), neutral, job);
                 let failed = values.is_err();
                 if send.send(values).is_err() || failed {
                     return;
@@ -403,24 +509,102 @@ fn stream(
         std::thread::Builder::new()
             .spawn_scoped(scope, read)
             .map_err(|e| Error::resource(at, format!("cannot start the reading thread: {e}")))?;
+        // The matrix before, for its bias.
+        let mut last: Option<(&TensorSpec, Loaded)> = None;
         for (job, row) in jobs.iter().zip(&mut report.tensors) {
-            let values = receive.recv().map_err(|_| Error::Internal("the reading thread ended early".into()))??;
-            row.promoted = job.dtype == Dtype::F16 && !fits_f16(&values);
-            row.dtype = if row.promoted { Dtype::F32 } else { job.dtype };
-            row.zero_outputs = zero_outputs(&job.spec, &values);
-            row.bytes = writer.write(&values, row.dtype)?;
+            let mut loaded = receive.recv().map_err(|_| Error::Internal("the reading thread ended early".into()))??;
+            row.zero_outputs = zero_outputs(&job.spec, &loaded.values);
+            match job.fate {
+                Fate::Neutral(value) => loaded.values.fill(value),
+                Fate::FoldedBias => {
+                    let (spec, weight) =
+                        last.as_ref().ok_or_else(|| Error::Internal(format!("no matrix before {}", row.name)))?;
+                    loaded.values = quantize::folded_bias(spec, &weight.values, &weight.fold, &loaded.values);
+                }
+                Fate::Folded(_) | Fate::Plain => {}
+            }
+            if job.dtype == Dtype::Int8 {
+                write_int8(job, &loaded, writer, row)?;
+            } else {
+                write_float(&loaded.values, job.dtype, writer, row)?;
+                if int8 && job.spec.matrix().is_some() {
+                    row.sqnr_db = Some(float_sqnr(&loaded.values, row.dtype));
+                }
+            }
+            last = matches!(job.fate, Fate::Folded(_)).then_some((&job.spec, loaded));
+        }
+        if int8 {
+            let table = report.tensors.iter().filter_map(|t| t.sqnr_db).map(|db| (db * 100.0).round() / 100.0);
+            writer.replace(keys::WEIGHT_SQNR, Value::Floats(table.collect()))?;
         }
         Ok(())
     })
 }
 
-/// The values of one tensor, all finite.
-fn load((source, at): (&dyn Checkpoint, &str), neutral: &Seeded, job: &Job) -> Result<Vec<f32>> {
+/// Writes a tensor as f32 or f16; a matrix beyond the range of f16 as f32.
+fn write_float(values: &[f32], dtype: Dtype, writer: &mut BlobWriter, row: &mut TensorReport) -> Result<()> {
+    row.promoted = dtype == Dtype::F16 && !fits_f16(values);
+    row.dtype = if row.promoted { Dtype::F32 } else { dtype };
+    row.bytes = writer.write(values, row.dtype)?;
+    Ok(())
+}
+
+/// Writes a matrix as int8, or (folded all the same) as f16 where int8 would be too coarse.
+fn write_int8(job: &Job, loaded: &Loaded, writer: &mut BlobWriter, row: &mut TensorReport) -> Result<()> {
+    let q: Quantized = quantize::quantize(&job.spec, &loaded.values, &loaded.fold, recipe::is_rotated(&job.spec));
+    row.sqnr_db = Some(q.sqnr_db());
+    if q.sqnr_db() >= WEIGHT_FLOOR_DB || q.signal == 0.0 {
+        row.bytes = writer.write_int8(QuantizedMatrix { values: &q.values, scales: &q.scales, signs: &q.signs })?;
+        return Ok(());
+    }
+    row.reason = Some(format!("int8 weights reach only {:.1} dB", q.sqnr_db()));
+    let folded = quantize::folded(&job.spec, &loaded.values, &loaded.fold);
+    write_float(&folded, Dtype::F16, writer, row)?;
+    row.sqnr_db = Some(float_sqnr(&folded, row.dtype));
+    Ok(())
+}
+
+/// Signal to error of values stored as floats.
+fn float_sqnr(values: &[f32], dtype: Dtype) -> f64 {
+    if dtype == Dtype::F32 {
+        return EXACT_DB;
+    }
+    let (signal, noise) = values.iter().fold((0.0, 0.0), |(s, n), &v| {
+        let (v, stored) = (f64::from(v), f64::from(through_f16(v)));
+        (s + v * v, n + (v - stored) * (v - stored))
+    });
+    sqnr_db(signal, noise)
+}
+
+/// The values of one tensor and of what is folded into it.
+fn load_with_parts((source, at): (&dyn Checkpoint, &str), neutral: &Seeded, job: &Job) -> Result<Loaded> {
+    let mut loaded = Loaded { values: load((source, at), neutral, job)?, fold: Fold::default() };
+    if let Fate::Folded(parts) = &job.fate {
+        for (part, from) in parts {
+            let values = Some(read((source, at), neutral, *from)?);
+            match part {
+                Part::Gain => loaded.fold.gain = values,
+                Part::Offset => loaded.fold.offset = values,
+                Part::Gamma => loaded.fold.gamma = values,
+            }
+        }
+    }
+    Ok(loaded)
+}
+
+/// The values of one tensor, wherever they come from.
+fn read((source, _): (&dyn Checkpoint, &str), neutral: &Seeded, from: (Origin, usize)) -> Result<Vec<f32>> {
     let mut values = Vec::new();
-    match job.from {
+    match from {
         (Origin::Checkpoint, index) => source.read_f32(index, &mut values)?,
         (Origin::Initialised, index) => neutral.read_f32(index, &mut values)?,
     }
+    Ok(values)
+}
+
+/// The values of one tensor, all finite.
+fn load((source, at): (&dyn Checkpoint, &str), neutral: &Seeded, job: &Job) -> Result<Vec<f32>> {
+    let values = read((source, at), neutral, job.from)?;
     if values.len() != job.spec.len() {
         return Err(Error::Internal(format!("{} values for {} {:?}", values.len(), job.spec.name, job.spec.shape)));
     }

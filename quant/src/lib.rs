@@ -3,6 +3,9 @@
 //! | file | what |
 //! |---|---|
 //! | `convert.rs` | [`convert()`]: a checkpoint to a `.sfw` blob, streaming |
+//! | `recipe.rs` | which matrix gets which type, what is folded into it |
+//! | `quantize.rs` | one matrix to int8: folding, rotation, step, rounding |
+//! | `work.rs` | multiply-adds of a matrix |
 //! | `names.rs` | wrapper prefixes, VGGT's names, nearest names |
 //! | `detect.rs` | a configuration from names and shapes |
 //! | `report.rs` | [`Report`]: what a conversion did |
@@ -30,12 +33,15 @@
 pub mod convert;
 mod detect;
 pub mod names;
+pub mod quantize;
+mod recipe;
 pub mod report;
 pub mod rng;
 mod safetensors_out;
 pub mod seeded;
+pub mod work;
 
-pub use convert::{Options, convert, convert_files, convert_to_bytes, parse_keep, plan, plan_files};
+pub use convert::{Options, convert, convert_checked, convert_files, convert_to_bytes, parse_keep, plan, plan_files};
 pub use report::Report;
 pub use safetensors_out::write_safetensors;
 pub use seeded::{Outputs, Seeded};

@@ -100,6 +100,35 @@ fn from_vggt(name: &str) -> Option<String> {
     None
 }
 
+/// Whether a name matches a pattern of literal text, `*` (any run) and `?` (any one byte).
+pub fn glob(pattern: &str, name: &str) -> bool {
+    let (p, n) = (pattern.as_bytes(), name.as_bytes());
+    let (mut i, mut j) = (0, 0);
+    // Position of the last star and of the name when it was met: where to go on after a mismatch.
+    let mut star: Option<(usize, usize)> = None;
+    while j < n.len() {
+        match p.get(i) {
+            Some(b'*') => {
+                star = Some((i, j));
+                i += 1;
+            }
+            Some(&c) if c == b'?' || c == n[j] => {
+                i += 1;
+                j += 1;
+            }
+            _ => match star {
+                Some((s, at)) => {
+                    star = Some((s, at + 1));
+                    i = s + 1;
+                    j = at + 1;
+                }
+                None => return false,
+            },
+        }
+    }
+    p[i..].iter().all(|&c| c == b'*')
+}
+
 /// The candidate with the fewest edits to `name`, if at most a third of it differs.
 pub(crate) fn nearest<'a>(name: &str, candidates: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let best = candidates.map(|c| (edits(name, c), c)).min()?;

@@ -30,6 +30,10 @@ pub struct TensorReport {
     pub promoted: bool,
     /// Outputs of a linear layer or convolution whose weights are all zero.
     pub zero_outputs: usize,
+    /// Signal to error of the stored weights, dB; matrices of an int8 conversion only, `None` in a dry run.
+    pub sqnr_db: Option<f64>,
+    /// Why a matrix is not of the type asked for.
+    pub reason: Option<String>,
 }
 
 /// What a conversion did, or would do.
@@ -70,6 +74,15 @@ impl Report {
         self.tensors.iter().map(|t| t.bytes).sum()
     }
 
+    /// Share of the weights of matrices that are of a type, in a conversion to int8.
+    pub fn matrix_share(&self, dtype: Dtype) -> f64 {
+        let weights = |t: &TensorReport| t.shape.iter().product::<usize>() as f64;
+        // A matrix that is not int8 says why.
+        let matrices = || self.tensors.iter().filter(|t| t.reason.is_some() || t.dtype == Dtype::Int8);
+        matrices().filter(|t| t.dtype == dtype).map(weights).sum::<f64>()
+            / matrices().map(weights).sum::<f64>().max(1.0)
+    }
+
     /// For people: one fact per line.
     pub fn lines(&self) -> Vec<String> {
         let mut lines = vec![
@@ -79,12 +92,22 @@ impl Report {
         ];
         let of = |d: Dtype| self.tensors.iter().filter(|t| t.dtype == d).count();
         lines.push(format!(
-            "precision {}: {} tensors f16, {} tensors f32, {} bytes",
+            "precision {}: {} tensors int8, {} tensors f16, {} tensors f32, {} bytes",
             self.precision.name(),
+            of(Dtype::Int8),
             of(Dtype::F16),
             of(Dtype::F32),
             self.tensor_bytes()
         ));
+        if self.precision == Dtype::Int8 {
+            let share = self.matrix_share(Dtype::Int8);
+            lines.push(format!("int8: {:.2} % of the matrix weights", 100.0 * share));
+            let worst =
+                self.tensors.iter().filter(|t| t.dtype == Dtype::Int8).filter_map(|t| Some((t.sqnr_db?, &t.name)));
+            if let Some((db, name)) = worst.min_by(|a, b| a.0.total_cmp(&b.0)) {
+                lines.push(format!("lowest signal to error of int8 weights: {db:.1} dB in {name}"));
+            }
+        }
         for (prefix, count) in &self.stripped {
             lines.push(format!("prefix {prefix} taken off {count} tensors"));
         }

@@ -139,6 +139,7 @@ fn assert_same(blob: &Blob, source: &Mock) {
         let tolerance = |w: f32| match blob.tensors()[i].dtype {
             Dtype::F32 => 0.0,
             Dtype::F16 => (w.abs() / 2048.0).max(2f32.powi(-25)),
+            Dtype::Int8 => panic!("{} is int8", t.name),
         };
         assert!(got.iter().zip(want).all(|(g, &w)| (g - w).abs() <= tolerance(w)), "{}", t.name);
     }

@@ -2,7 +2,9 @@
 //!
 //! | file | what |
 //! |---|---|
+//! | `int8.rs` | int8 models of tensors in memory, and the network that breaks naive quantization |
 //! | `tiny.rs` | tiny random networks, clips for them, and all stages of a run |
 #![deny(unsafe_code)]
 
+pub mod int8;
 pub mod tiny;

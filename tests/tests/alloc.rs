@@ -2,6 +2,7 @@
 
 use sf_formats::blob::Dtype;
 use sf_formats::config::Head;
+use sf_tests::int8::converted;
 use sf_tests::tiny::{Frames, model, session, tensors, tiny, tiny_guided};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
@@ -41,8 +42,12 @@ fn a_warm_session_allocates_nothing() {
         ..tiny()
     };
     for config in [pyramids, linear, tiny_guided()] {
-        for dtype in [Dtype::F32, Dtype::F16] {
-            let model = model(&config, &tensors(&config, 1), dtype);
+        for dtype in Dtype::ALL {
+            let tensors = tensors(&config, 1);
+            let model = match dtype {
+                Dtype::Int8 => converted(&config, &tensors, sf_quant::Options::to(dtype)),
+                _ => model(&config, &tensors, dtype),
+            };
             let clip = Frames::new(3, 28, 42, 1);
             let before = BYTES.load(SeqCst);
             let mut session = session(&model, clip.shape);

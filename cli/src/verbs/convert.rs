@@ -1,17 +1,28 @@
 //! `convert`: training checkpoints to a weight blob.
 
-use crate::args::{FileArgs, Precision, path_json};
+use crate::args::{EngineArgs, FileArgs, Precision, path_json};
+use crate::golden;
 use crate::network::{self, Preset, Watched};
 use crate::output::{Console, human_bytes, human_count};
+use crate::scan::{self, Judge};
 use crate::signals;
+use crate::versus::{self, Verdict};
 use serde_json::{Value, json};
+use sf_eval::Gate;
+use sf_formats::atomic::AtomicFile;
+use sf_formats::blob::{Blob, LoadMode, Verify};
 use sf_formats::checkpoint::{self, Checkpoint, CheckpointTensor};
+use sf_formats::clip::{Clip, ClipOptions};
+use sf_formats::config::Value as Setting;
 use sf_formats::digest::hex;
 use sf_formats::error::{escape, escape_path};
+use sf_formats::meta::keys;
 use sf_formats::{Dtype, Error, Result};
-use sf_quant::convert::refuse_own_input;
-use sf_quant::{Options, Report, convert, plan};
+use sf_quant::convert::{SCAN_REASON, refuse_own_input};
+use sf_quant::{Options, Report, convert_checked, plan};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use streetforward::Model;
 
 /// What to convert to what.
 #[derive(clap::Args)]
@@ -21,11 +32,11 @@ pub(crate) struct Args {
     inputs: Vec<PathBuf>,
     #[command(flatten)]
     file: FileArgs,
-    /// Precision of the weight matrices; sensitive ones stay f32
+    /// Precision of the weight matrices; sensitive ones stay f32 or f16
     #[arg(long, value_enum, default_value_t = Precision::F32)]
     to: Precision,
-    /// Exceptions by the start of a tensor's name, as gs_head.=f32,decoder.0.=f16
-    #[arg(long, value_name = "PREFIX=PRECISION", value_delimiter = ',', value_parser = keep)]
+    /// Exceptions by the start of a tensor's name, * and ? as wildcards, as gs_head.=f32,decoder.*.mlp.fc2=f16
+    #[arg(long, value_name = "PATTERN=PRECISION", value_delimiter = ',', value_parser = keep)]
     keep: Vec<(String, Dtype)>,
     /// JSON file of settings for a checkpoint that carries none
     #[arg(long, value_name = "FILE")]
@@ -42,6 +53,18 @@ pub(crate) struct Args {
     /// Text file with the licence of the weights, for the blob
     #[arg(long, value_name = "FILE")]
     licence: Option<PathBuf>,
+    /// Clips on which the result must keep up with the f32 model: no blob (exit code 1) when it does not. An int8
+    /// model that does not is scanned, and its most sensitive layers become f16, up to 5 % of the multiply-adds
+    #[arg(long, value_name = "CLIP", num_args = 1..)]
+    check: Vec<PathBuf>,
+    /// Bounds of --check, as those of compare
+    #[arg(long, value_name = "KEY=LIMIT", value_delimiter = ',', value_parser = versus::parse_gate, default_value = "int8")]
+    gate: Vec<Vec<Gate>>,
+    /// Write the blob although --check failed; what was measured is stored in it
+    #[arg(long, requires = "check")]
+    allow_inaccurate: bool,
+    #[command(flatten)]
+    engine: EngineArgs,
     /// Report what would be done; write nothing
     #[arg(long)]
     dry_run: bool,
@@ -63,7 +86,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         (None, Some(preset)) => Some(network::preset(preset)),
         (None, None) => None,
     };
-    let options = Options {
+    let mut options = Options {
+        golden: true,
         keep: args.keep.clone(),
         config,
         allow_missing: args.allow_missing.clone(),
@@ -75,17 +99,59 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     if let Some(file) = &args.map {
         source = Box::new(Renamed::new(source, file)?);
     }
-    let report = if args.dry_run {
-        plan(&*source, &options)?
-    } else {
-        signals::guard_file(output);
-        let progress = console.progress(source.tensors().len() as u64, "convert");
-        convert(&Watched::new(&*source, &progress), output, args.file.overwrite(), &options)?
-    };
-    console.report(&to_json(args, &report), &to_text(args, &report))
+    if args.dry_run {
+        let report = plan(&*source, &options)?;
+        return console.report(&to_json(args, &report, None), &to_text(args, &report, None));
+    }
+    // An output that cannot be written is better known before clips are run.
+    drop(AtomicFile::create(output, args.file.overwrite())?);
+    signals::guard_file(output);
+    let gates = args.gate.concat();
+    let mut judge = None;
+    if !args.check.is_empty() {
+        let clips: Vec<Clip> =
+            args.check.iter().map(|p| Clip::open(p, &ClipOptions::default())).collect::<Result<_>>()?;
+        let mut j = Judge::new(&*source, &options, &clips, &args.engine)?;
+        if args.to == Precision::Int8 {
+            options.promoted = match j.scan(&options, &gates, console) {
+                Err(Error::CheckFailed(why)) if args.allow_inaccurate => {
+                    console.warn(why);
+                    Vec::new()
+                }
+                found => found?,
+            };
+        }
+        options.checks = gates.iter().map(|g| g.key.clone()).collect();
+        judge = Some(j);
+    }
+    let mut verdict = None;
+    let progress = console.progress(source.tensors().len() as u64, "convert");
+    let watched = Watched::new(&*source, &progress);
+    let report = convert_checked(&watched, output, args.file.overwrite(), &options, |path, _| {
+        let model = Arc::new(Model::from_blob(Blob::open(path, LoadMode::Map, Verify::Structure)?)?);
+        let mut found = vec![(keys::GOLDEN.to_string(), Setting::Text(hex(&golden::run(&model)?)))];
+        if let Some(judge) = &mut judge {
+            let v = judge.verdict(&model)?;
+            let failures = versus::failures(&gates, &v);
+            if !failures.is_empty() && !args.allow_inaccurate {
+                return Err(Error::CheckFailed(format!("no blob is written: {}", failures.join("; "))));
+            }
+            let values = gates.iter().map(|g| v.outputs.iter().find(|(k, _)| *k == g.key).and_then(|(_, v)| *v));
+            let values = values.map(|v| v.filter(|v| v.is_finite()).unwrap_or(-1.0)).collect();
+            found.push((keys::CHECK_VALUES.to_string(), Setting::Floats(values)));
+            verdict = Some(v);
+        }
+        Ok(found)
+    })?;
+    drop(progress);
+    let checked = verdict.as_ref().map(|v| (&gates[..], v));
+    console.report(&to_json(args, &report, checked), &to_text(args, &report, checked))
 }
 
-fn to_json(args: &Args, report: &Report) -> Value {
+/// Gates and what was measured.
+type Checked<'a> = Option<(&'a [Gate], &'a Verdict)>;
+
+fn to_json(args: &Args, report: &Report, checked: Checked) -> Value {
     let tensor = |t: &sf_quant::report::TensorReport| {
         json!({
             "name": t.name,
@@ -95,6 +161,8 @@ fn to_json(args: &Args, report: &Report) -> Value {
             "initialised": t.origin == sf_quant::report::Origin::Initialised,
             "promoted": t.promoted,
             "zero_outputs": t.zero_outputs,
+            "weight_sqnr_db": t.sqnr_db,
+            "reason": t.reason,
         })
     };
     json!({
@@ -114,12 +182,28 @@ fn to_json(args: &Args, report: &Report) -> Value {
         "source_digest": report.source_digest.as_ref().map(hex),
         "digest": report.blob_digest.as_ref().map(hex),
         "config": report.config.to_json(),
+        "check": checked.map(|(gates, verdict)| versus::to_json(gates, verdict)),
+        "promoted_share": scan::share(&report.config, &promoted(report)),
         "tensors": report.tensors.iter().map(tensor).collect::<Value>(),
     })
 }
 
-fn to_text(args: &Args, report: &Report) -> String {
+/// Matrices that the scan made f16.
+fn promoted(report: &Report) -> Vec<String> {
+    let by_scan = |t: &&sf_quant::report::TensorReport| t.reason.as_deref() == Some(SCAN_REASON);
+    report.tensors.iter().filter(by_scan).map(|t| t.name.clone()).collect()
+}
+
+fn to_text(args: &Args, report: &Report, checked: Checked) -> String {
     let mut text = String::new();
+    let promoted = promoted(report);
+    if !promoted.is_empty() {
+        let share = 100.0 * scan::share(&report.config, &promoted);
+        text.push_str(&format!("f16 after the scan, {share:.2} % of the multiply-adds: {}\n", promoted.join(", ")));
+    }
+    if let Some((gates, verdict)) = checked {
+        text.push_str(&versus::to_text(gates, verdict));
+    }
     for line in report.lines() {
         text.push_str(&line);
         text.push('\n');

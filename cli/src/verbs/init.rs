@@ -3,14 +3,20 @@
 //! Written tensor by tensor, so that the largest preset needs little memory.
 
 use crate::args::{FileArgs, Precision, has_extension, path_json};
+use crate::golden;
 use crate::network::{self, NetworkArgs};
 use crate::output::{Console, human_bytes, human_count};
 use crate::signals;
 use serde_json::json;
+use sf_formats::blob::{Blob, LoadMode, Verify};
+use sf_formats::config::Value;
 use sf_formats::digest::hex;
 use sf_formats::error::escape_path;
+use sf_formats::meta::keys;
 use sf_formats::{Error, Result, arch};
-use sf_quant::{Options, Outputs, Seeded, convert, write_safetensors};
+use sf_quant::{Options, Outputs, Seeded, convert_checked, write_safetensors};
+use std::sync::Arc;
+use streetforward::Model;
 
 /// Which network.
 #[derive(clap::Args)]
@@ -36,15 +42,20 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         return Err(Error::usage(format!("{}: the output ends in .sfw or .safetensors", escape_path(output))));
     }
     if !blob && args.to != Precision::F32 {
-        return Err(Error::usage("--to f16 is for .sfw outputs; a checkpoint is f32"));
+        return Err(Error::usage("--to is for .sfw outputs; a checkpoint is f32"));
     }
     let seeded = Seeded::new(&config, args.seed, Outputs::Random)?;
     signals::guard_file(output);
     let progress = console.progress(seeded.specs().len() as u64, "init");
     let source = network::Watched::new(&seeded, &progress);
     let digest = if blob {
-        let options = Options { command: format!("init --seed {}", args.seed), ..Options::to(args.to.dtype()) };
-        convert(&source, output, args.file.overwrite(), &options)?.blob_digest
+        let command = format!("init --seed {} --to {}", args.seed, args.to.dtype().name());
+        let options = Options { command, golden: true, ..Options::to(args.to.dtype()) };
+        convert_checked(&source, output, args.file.overwrite(), &options, |path, _| {
+            let model = Arc::new(Model::from_blob(Blob::open(path, LoadMode::Map, Verify::Structure)?)?);
+            Ok(vec![(keys::GOLDEN.to_string(), Value::Text(hex(&golden::run(&model)?)))])
+        })?
+        .blob_digest
     } else {
         write_safetensors(&source, output, args.file.overwrite())?;
         None

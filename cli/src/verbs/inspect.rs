@@ -177,6 +177,7 @@ fn of_blob(path: &Path, stats: bool) -> Result<Contents> {
         let dtype = match t.dtype {
             Dtype::F32 => "F32",
             Dtype::F16 => "F16",
+            Dtype::Int8 => "INT8",
         };
         tensors.push(Tensor {
             name: t.spec.name.clone(),

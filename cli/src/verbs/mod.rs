@@ -1,5 +1,6 @@
 //! One file per verb; each has its arguments and a `run` that joins the crates.
 
+mod compare;
 mod convert;
 mod demo;
 mod doctor;
@@ -36,6 +37,8 @@ pub(crate) enum Verb {
     Verify(verify::Args),
     /// Measure a model against clips with ground truth
     Eval(eval::Args),
+    /// Measure what one model predicts against another, as int8 against f32
+    Compare(compare::Args),
     /// Write a synthetic street clip with exact ground truth
     Synth(synth::Args),
     /// Describe this machine: processor, memory, threads, chosen kernels
@@ -55,6 +58,7 @@ impl Verb {
             Verb::Inspect(args) => inspect::run(args, console),
             Verb::Verify(args) => verify::run(args, console),
             Verb::Eval(args) => eval::run(args, console),
+            Verb::Compare(args) => compare::run(args, console),
             Verb::Synth(args) => synth::run(args, console),
             Verb::Doctor(args) => doctor::run(args, console),
         }

@@ -2,20 +2,22 @@
 //!
 //! Structure, every tensor's digest and every value are checked exactly as the engine checks them at
 //! load. With `--run` a small seeded clip goes through the network on one thread and on two: the digests of
-//! everything predicted must be equal, and can be compared between machines.
+//! everything predicted must be equal, and equal to the one that the converter found and stored.
 
 use crate::args::{Load, path_json};
+use crate::golden;
 use crate::output::{Console, human_bytes, human_count};
-use crate::reconstruct::output_digest;
 use serde_json::json;
 use sf_formats::blob::{Blob, Verify};
 use sf_formats::digest::{Digest, hex, parse_hex};
 use sf_formats::error::escape_path;
+use sf_formats::meta::keys;
 use sf_formats::{Error, Result, arch};
+use sf_quant::convert::NO_DIGEST;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
-use streetforward::{ClipShape, Input, Model, Options, Session};
+use streetforward::Model;
 
 /// What to verify.
 #[derive(clap::Args)]
@@ -26,7 +28,7 @@ pub(crate) struct Args {
     /// The digest the blob must have, 64 hexadecimal digits
     #[arg(long, value_name = "HEX", value_parser = digest)]
     digest: Option<Digest>,
-    /// Run a small seeded clip on one and on two threads and compare
+    /// Run a small seeded clip on one and on two threads and compare, also with what the converter found
     #[arg(long)]
     run: bool,
     /// How the weight blob is read
@@ -50,7 +52,14 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let parameters = arch::parameters(blob.config());
     let tensors = blob.tensors().len();
     let digest = hex(blob.digest());
-    let ran = if args.run { Some(hex(&self_test(blob)?)) } else { None };
+    let golden = blob.meta().text(keys::GOLDEN).filter(|g| *g != NO_DIGEST).map(str::to_string);
+    let ran = if args.run { Some(hex(&golden::run(&Arc::new(Model::from_blob(blob)?))?)) } else { None };
+    if let (Some(ran), Some(golden)) = (&ran, &golden)
+        && ran != golden
+    {
+        let why = format!("the golden run gives {ran}, the converter found {golden}: this machine computes otherwise");
+        return Err(Error::integrity(escape_path(&args.model), why));
+    }
     let json = json!({
         "schema": "streetforward.verify/1",
         "path": path_json(&args.model),
@@ -60,6 +69,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         "parameters": parameters,
         "verify_ms": seconds * 1e3,
         "run_digest": ran,
+        "golden_digest": golden,
     });
     let mut text = String::new();
     let mut row = |name: &str, value: String| text.push_str(&format!("{name:<10} {value}\n"));
@@ -76,33 +86,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         ),
     );
     if let Some(ran) = ran {
-        row("ran", format!("{ran} on 1 and on 2 threads"));
+        let known = if golden.is_some() { ", as the converter found" } else { "" };
+        row("ran", format!("{ran} on 1 and on 2 threads{known}"));
     }
     console.report(&json, &text)
-}
-
-/// Runs a seeded clip of three frames, 4x3 patches each, on one and on two threads; the digest of the
-/// predictions.
-fn self_test(blob: Blob) -> Result<Digest> {
-    let patch = blob.config().patch as usize;
-    let shape = ClipShape { frames: 3, height: 3 * patch, width: 4 * patch };
-    // Smooth pictures that differ from frame to frame; integer arithmetic, so equal everywhere.
-    let pixel = |i: usize| {
-        let (c, x, y) = (i % 3, i / 3 % shape.width, i / (3 * shape.width));
-        ((x * (5 + c) + y * (3 + 2 * c) + x * y / 7) % 256) as u8
-    };
-    let images: Vec<u8> = (0..shape.frames * shape.height * shape.width * 3).map(pixel).collect();
-    let input = Input { shape, images: &images, times: &[0.0, 0.1, 0.25], k: None };
-    let place = blob.path().map_or_else(|| "blob".into(), escape_path);
-    let model = Arc::new(Model::from_blob(blob)?);
-    let on = |threads: usize| -> Result<Digest> {
-        let mut session = Session::new(Arc::clone(&model), shape, Options { threads, ..Options::default() })?;
-        Ok(output_digest(session.run(&input)?))
-    };
-    let (one, two) = (on(1)?, on(2)?);
-    if one != two {
-        let why = format!("one thread gives {}, two give {}: this machine computes wrongly", hex(&one), hex(&two));
-        return Err(Error::integrity(place, why));
-    }
-    Ok(one)
 }

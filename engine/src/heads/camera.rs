@@ -5,10 +5,10 @@
 
 use super::decoder;
 use crate::arena::{carve, carved_len};
-use crate::block::Net;
 use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::{self, Linear};
+use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
 use sf_formats::Result;

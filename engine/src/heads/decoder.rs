@@ -2,10 +2,11 @@
 //! specification 1.3, step 8). No layer scale, no q/k norms.
 
 use crate::arena::{carve, carved_len};
-use crate::block::{self, BlockShape, Net, Sight};
+use crate::block::{self, BlockShape, Sight};
 use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::Decoder;
+use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::{Tables, Tokens};
 use sf_formats::Result;
@@ -15,8 +16,7 @@ use sf_ops::mat::{Mat, MatMut};
 /// Tokens, block scratch.
 fn lens(decoder: &Decoder, d: &Dims, tokens: usize, threads: usize) -> [usize; 2] {
     let mask = d.frame_mask(tokens);
-    let blocks = decoder.blocks.iter().map(|b| BlockShape::of(b, threads).scratch_len(&mask)).max();
-    [d.frames * tokens * decoder.projects.weight.n, blocks.unwrap_or(0)]
+    [d.frames * tokens * decoder.projects.weight.n, BlockShape::most(&decoder.blocks, &mask, threads)]
 }
 
 /// Values of working memory of [`run`].

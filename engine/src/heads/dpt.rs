@@ -13,10 +13,10 @@
 //! RCU(x) = conv2(relu(conv1(relu(x)))) + relu(x), or + x with the `raw` skip.
 
 use crate::arena::{carve, carved_len};
-use crate::block::Net;
 use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::{Dpt, Linear, Unit};
+use crate::net::Net;
 use crate::tables::DptTables;
 use sf_formats::config::RcuSkip;
 use sf_ops::conv::{self, Conv, ConvTranspose};
@@ -26,16 +26,17 @@ use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
 use sf_ops::resize::{Corners, bilinear};
 
 /// Height and width.
-type Size = (usize, usize);
+pub(crate) type Size = (usize, usize);
 
 /// Sizes of the four levels, finest first.
-fn levels(d: &Dims) -> [Size; 4] {
+pub(crate) fn levels(d: &Dims) -> [Size; 4] {
     let half = |n| conv::conv_out(n, 3, 2, 1);
     let (r, c) = (d.rows, d.cols);
     [(4 * r, 4 * c), (2 * r, 2 * c), (r, c), (half(r), half(c))]
 }
 
-fn area(s: Size) -> usize {
+/// Pixels of a level.
+pub(crate) fn area(s: Size) -> usize {
     s.0 * s.1
 }
 

@@ -15,9 +15,9 @@
 
 use super::decoder::{self, Job};
 use crate::arena::{carve, carved_len};
-use crate::block::Net;
 use crate::dims::Dims;
 use crate::model::{Guided, Linear};
+use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::Tables;
 use sf_formats::Result;

@@ -19,10 +19,10 @@ pub(crate) mod guided;
 pub(crate) mod linear;
 pub(crate) mod stem;
 
-use crate::block::Net;
 use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::DenseHead;
+use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::{DptTables, Tables, Tokens};
 use sf_formats::Result;

@@ -4,9 +4,9 @@
 //! computed once per clip: `[frames, height/2, width/2, channels]`, a byte per channel and pixel of the clip, for
 //! a hundredth of one head's work.
 
-use crate::block::Net;
 use crate::dims::Dims;
 use crate::model::Linear;
+use crate::net::Net;
 use crate::preprocess::Normaliser;
 use crate::probe::Probe;
 use sf_formats::Result;

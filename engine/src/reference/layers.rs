@@ -60,7 +60,9 @@ pub(super) fn block(w: &Weights, p: &str, x: &mut [f32], a: Attention) {
     let linear = |name: &str, x: &[f32]| {
         let b = get(&format!("{name}.bias"));
         let wt = get(&format!("{name}.weight"));
-        naive::linear(Mat::new(x, rows, wt.len() / b.len()), wt, Some(b))
+        let k = wt.len() / b.len();
+        let x = w.input(&format!("{p}.{name}"), x, k);
+        naive::linear(Mat::new(&x, rows, k), wt, Some(b))
     };
     let norm = |name: &str, x: &[f32]| {
         let (gain, offset) = (get(&format!("{name}.weight")), get(&format!("{name}.bias")));

@@ -28,11 +28,17 @@ use sf_formats::config::{Concat, DepthMap, Head, HeadKind, ModelConfig, MotionLa
 use sf_formats::{Error, Intrinsics, Pose, Result, arch};
 use sf_ops::mat::{Hwc, Mat};
 use sf_ops::reference as naive;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// Tensors by public name, in checkpoint order and f32.
-#[derive(Debug)]
-pub struct Weights(BTreeMap<String, Vec<f32>>);
+pub struct Weights {
+    tensors: BTreeMap<String, Vec<f32>>,
+    change: Option<Change>,
+}
+
+/// Changes the input rows `[.., k]` of the linear layer of a name; see [`Weights::with_inputs`].
+pub type Change = Box<dyn Fn(&str, &mut [f32], usize) + Send + Sync>;
 
 impl Weights {
     /// Reads every tensor the configuration asks for; `Model` when one is missing or misshapen.
@@ -49,7 +55,7 @@ impl Weights {
             checkpoint.read_f32(index, &mut values)?;
             map.insert(spec.name, values);
         }
-        Ok(Weights(map))
+        Ok(Weights { tensors: map, change: None })
     }
 
     /// From tensors in memory; `Model` when one is missing or has the wrong length.
@@ -60,15 +66,29 @@ impl Weights {
                 return Err(Error::model(&spec.name, format!("{len:?} values must be {}", spec.len())));
             }
         }
-        Ok(Weights(tensors))
+        Ok(Weights { tensors, change: None })
+    }
+
+    /// The same weights, with the inputs of every linear layer of a transformer block changed before it is applied: how
+    /// a quantizer would round them, for judging recipes.
+    pub fn with_inputs(self, change: Change) -> Weights {
+        Weights { change: Some(change), ..self }
+    }
+
+    /// The input of a layer as it is computed with.
+    fn input<'x>(&self, name: &str, x: &'x [f32], k: usize) -> Cow<'x, [f32]> {
+        let Some(change) = &self.change else { return Cow::Borrowed(x) };
+        let mut x = x.to_vec();
+        change(name, &mut x, k);
+        Cow::Owned(x)
     }
 
     fn get(&self, name: &str) -> &[f32] {
-        self.0.get(name).unwrap_or_else(|| panic!("{name} is in the tensor list that was loaded"))
+        self.tensors.get(name).unwrap_or_else(|| panic!("{name} is in the tensor list that was loaded"))
     }
 
     fn optional(&self, name: &str) -> Option<&[f32]> {
-        self.0.get(name).map(Vec::as_slice)
+        self.tensors.get(name).map(Vec::as_slice)
     }
 }
 

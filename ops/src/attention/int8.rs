@@ -40,6 +40,7 @@ use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::hadamard::Rotation;
 use crate::mat::{Mat, MatMut};
+use crate::opclock::{self, Op};
 use crate::par::SharedMut;
 use crate::rope::{QkNorm, RopeTable};
 use crate::simd::LANES;
@@ -520,6 +521,7 @@ pub(crate) fn run(ctx: Ctx, x: Heads, mask: FrameMask, scratch: &mut [f32], out:
     if x.qkv.rows == 0 {
         return;
     }
+    let _span = opclock::span(Op::AttentionS8, || super::work(&mask, x.heads * d));
     let skip = scratch.as_ptr().align_offset(LINE * size_of::<f32>()).min(LINE);
     let job = Job { kernels: ctx.kernels, x, d, mask, room: Room::new(tokens, d), watch };
     let (unit_len, worker_len) = (job.room.unit(), job.room.worker);

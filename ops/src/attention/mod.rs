@@ -13,6 +13,7 @@ use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
 use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::mat::{Mat, MatMut};
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use softmax::{Rows, SoftmaxTile};
 
@@ -203,6 +204,12 @@ impl Job<'_> {
     }
 }
 
+/// Both products of every query with every key that it sees; q, k, v and the result once.
+fn work(mask: &FrameMask, dim: usize) -> Work {
+    let pairs: usize = (0..mask.frames).map(|a| mask.keys(a).len() * mask.tokens * mask.tokens).sum();
+    Work { macs: (2 * pairs * dim) as u64, bytes: (16 * mask.frames * mask.tokens * dim) as u64 }
+}
+
 /// Which queries.
 struct Block {
     frame: usize,
@@ -225,6 +232,7 @@ pub fn attention(ctx: Ctx, qkv: Mat, heads: usize, mask: FrameMask, scratch: &mu
     if qkv.rows == 0 {
         return;
     }
+    let _span = opclock::span(Op::Attention, || work(&mask, heads * d));
     let room = Room::new(tokens, d);
     let units = frames * heads;
     let (k, rest) = scratch.split_at_mut(units * room.k);

@@ -7,6 +7,7 @@ pub(crate) mod tile;
 
 use crate::cpu::{Ctx, Kernels};
 use crate::mat::{Mat, MatMut};
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use pack::{Change, MAX_MR, RowPack, strided};
 use tile::{Finish, Tile};
@@ -269,5 +270,6 @@ pub fn gemm(ctx: Ctx, a: Mat, w: Panels, ep: Epilogue, out: MatMut) {
     let stride = out.stride;
     let sink = RowSink { out: SharedMut::new(out.data), stride, add };
     let source = Rows(a);
+    let _span = opclock::span(Op::Gemm, || Work::product(a.rows, &w, a.rows * a.cols));
     product(ctx, &Product { m: a.rows, source: &source, w, bias: ep.bias, act: ep.act, gamma: ep.gamma, sink: &sink });
 }

@@ -32,6 +32,7 @@ use super::Epilogue;
 use super::pack::{MAX_MR, NR};
 use crate::cpu::Ctx;
 use crate::mat::MatMut;
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use pack::{PanelsS8, QUAD, RowsS8, STEP, padded_k};
 use table::{Activations, GemmS8Kernel};
@@ -284,6 +285,8 @@ pub fn gemm_s8(ctx: Ctx, a: RowsS8, w: PanelsS8, ep: Epilogue, out: MatMut) {
         assert!(v.is_none_or(|v| v.len() == w.n), "{what} of {} outputs", w.n);
     }
     let stride = out.stride;
+    let (macs, bytes) = (a.m * w.n * w.k, (a.m + w.n) * w.k + 4 * a.m * w.n);
+    let _span = opclock::span(Op::GemmS8, || Work { macs: macs as u64, bytes: bytes as u64 });
     let sink = Sink::Values { ep, out: SharedMut::new(out.data), stride };
     product(ctx, &Product::new(ctx, a, w, sink));
 }

@@ -1,0 +1,106 @@
+//! [`Net`]: weights, the machine to run them on, and the linear layers of every precision.
+//!
+//! An int8 layer quantizes its input rows (per token, after the norm in front and the rotation, in one pass) into
+//! [`Rows`], then multiplies. One layer runs at a time, so one area serves all of them.
+
+use crate::arena::Arena;
+use crate::model::{Linear, Model, Norm, PanelRef, VecRef, Weight};
+use sf_formats::Result;
+use sf_ops::cpu::Ctx;
+use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, padded_k};
+use sf_ops::hadamard::Rotation;
+use sf_ops::mat::{Mat, MatMut};
+use sf_ops::quantize::{self, Before, quantize};
+use std::cell::RefCell;
+
+/// Quantized rows of the layer in progress.
+#[derive(Debug)]
+pub(crate) struct Rows(RefCell<Arena>);
+
+/// Values of [`Rows`] for `m` rows of `k` inputs: four bytes each, then the scales from a new line on.
+fn rows_len(m: usize, k: usize) -> [usize; 2] {
+    [m * padded_k(k) / 4, m]
+}
+
+impl Rows {
+    /// Room for `len` values, the largest [`Rows::len`] of all layers.
+    pub(crate) fn new(len: usize) -> Result<Rows> {
+        Ok(Rows(RefCell::new(Arena::new(len)?)))
+    }
+
+    /// Values that a layer on `m` rows needs: none unless it is int8.
+    pub(crate) fn len(weight: &PanelRef, m: usize) -> usize {
+        if weight.is_int8() { crate::arena::carved_len(rows_len(m, weight.k)) } else { 0 }
+    }
+}
+
+/// Weights and the machine to run them on.
+#[derive(Clone, Copy)]
+pub(crate) struct Net<'a> {
+    pub(crate) ctx: Ctx<'a>,
+    pub(crate) model: &'a Model,
+    pub(crate) rows: &'a Rows,
+}
+
+impl Net<'_> {
+    /// out = act(x W^T + b).
+    pub(crate) fn linear(&self, l: &Linear, act: Act, x: Mat, out: MatMut) {
+        self.layer(l, None, x, Epilogue { act, ..Epilogue::default() }, out);
+    }
+
+    /// out += gamma * act(x W^T + b).
+    pub(crate) fn linear_onto(&self, l: &Linear, act: Act, gamma: Option<VecRef>, x: Mat, out: MatMut) {
+        let gamma = gamma.map(|g| self.model.values(g));
+        self.layer(l, None, x, Epilogue { act, gamma, residual: true, ..Epilogue::default() }, out);
+    }
+
+    /// out = act(norm(x) W^T + b). `normed` has as many values as x, or none for an int8 layer, which needs no
+    /// normed tokens.
+    pub(crate) fn normed_linear(&self, n: &Norm, l: &Linear, act: Act, (x, normed): (Mat, &mut [f32]), out: MatMut) {
+        let ep = Epilogue { act, ..Epilogue::default() };
+        if l.weight.is_int8() {
+            self.layer(l, Some(n), x, ep, out);
+        } else {
+            let normed = &mut normed[..x.rows * x.cols];
+            self.norm(n, x, MatMut::new(normed, x.rows, x.cols));
+            self.layer(l, None, Mat::new(normed, x.rows, x.cols), ep, out);
+        }
+    }
+
+    /// out = norm(x).
+    pub(crate) fn norm(&self, n: &Norm, x: Mat, out: MatMut) {
+        sf_ops::layernorm::layernorm(self.ctx, x, self.model.values(n.gain), self.model.values(n.offset), n.eps, out);
+    }
+
+    /// A layer of any precision; the norm in front only for int8.
+    fn layer(&self, l: &Linear, norm: Option<&Norm>, x: Mat, ep: Epilogue, out: MatMut) {
+        let ep = Epilogue { bias: l.bias.map(|b| self.model.values(b)), ..ep };
+        match self.model.weight(&l.weight) {
+            Weight::Float(panels) => {
+                assert!(norm.is_none(), "a norm fused with a float layer");
+                gemm(self.ctx, x, panels, ep, out);
+            }
+            Weight::Int8(panels, rotation) => self.int8((panels, rotation), norm, x, ep, out),
+        }
+    }
+
+    fn int8(
+        &self,
+        (w, rotation): (PanelsS8, Option<Rotation>),
+        norm: Option<&Norm>,
+        x: Mat,
+        ep: Epilogue,
+        out: MatMut,
+    ) {
+        let norm = norm.map(|n| {
+            let affine = (!n.plain).then(|| (self.model.values(n.gain), self.model.values(n.offset)));
+            quantize::Norm { affine, eps: n.eps }
+        });
+        let mut area = self.rows.0.borrow_mut();
+        let [bytes, scales] = crate::arena::carve(area.all(), rows_len(x.rows, x.cols));
+        let bytes: &mut [i8] = bytemuck::cast_slice_mut(bytes);
+        let (m, k) = (x.rows, x.cols);
+        quantize(self.ctx, x, Before { norm, rotation }, RowsS8Mut { m, k, data: bytes, scales });
+        gemm_s8(self.ctx, RowsS8 { m, k, data: bytes, scales }, w, ep, out);
+    }
+}
