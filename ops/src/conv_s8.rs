@@ -23,6 +23,7 @@ use crate::gemm::s8::tile::{ColumnsS8, FinishS8, MAX_NV, Plus, TileS8};
 use crate::gemm::s8::{STEPS, starts};
 use crate::gemm::{Act, Sink};
 use crate::mat::{Hwc, HwcMut};
+use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::quantize::{MapOut, MapScale, ToMap, inverse_and_scale, larger};
 use std::ops::Range;
@@ -182,6 +183,11 @@ fn run(ctx: Ctx, x: Hwc, conv: &ConvS8, out: &Out) {
     if shape.oh * shape.ow * weight.n == 0 {
         return;
     }
+    let _span = opclock::span(Op::Conv, || {
+        let pixels = shape.oh * shape.ow;
+        let bytes = weight.data.len() + 4 * (x.h * x.w * x.c + pixels * weight.n);
+        Work { macs: (pixels * weight.n * weight.k) as u64, bytes: bytes as u64 }
+    });
     let kernel = ctx.kernels.product_s8;
     let layer = Layer { ctx, kernel, x, shape, weight, conv };
     let band = shape.band(BUDGET, FEWEST);
