@@ -24,7 +24,7 @@
 //! | `clip_source.rs`, `transforms.rs` | what a path holds: folders, lists, `transforms.json` |
 //! | `truth.rs` | [`clip::GroundTruth`]; clips as folders with it |
 //! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
-//! | `picture.rs` | depth, velocity and other numbers as pictures with a known scale |
+//! | `picture.rs`, `label.rs` | depth, velocity and other numbers as pictures with a known scale; small text |
 //! | `scene_io.rs`, `ply.rs` | [`Scene::save`], [`Scene::load`]; splats as PLY and PLY sequences |
 //! | `camera_json.rs`, `poses_io.rs` | camera paths; poses for nerfstudio, TUM, KITTI, COLMAP |
 //! | `sniff.rs`, `json.rs` | what a file is by its content; JSON without equal keys |
@@ -52,6 +52,7 @@ pub mod digest;
 pub mod error;
 pub mod image_io;
 mod json;
+pub mod label;
 mod map;
 pub mod meta;
 pub mod npy;

@@ -1,12 +1,17 @@
 //! Numbers as pictures for people. Every picture has a scale that the caller knows and can print.
 //!
-//! * depth: linear in inverse depth (as a stereo camera's error is), near is light yellow, far is dark
-//!   blue, no depth is black;
+//! * depth: logarithmic, so equal ratios of depth are equal steps of colour; near is light yellow, far is dark
+//!   blue, no depth is black; neighbouring stops differ equally to the eye (a path through OKLab by its length);
 //! * velocity: seen from above, direction is hue (forward green-yellow 90 degrees, right 0 degrees red),
 //!   horizontal speed is saturation: white stands still, a full colour is the top of the scale or more;
+//! * dynamic: the picture in gray, orange by probability;
 //! * gray: linear.
+//!
+//! [`depth_legend`] and [`velocity_legend`] are the scales with numbers.
 
 use crate::image_io::Rgb8;
+use crate::label;
+use crate::real::{exp, ln};
 
 /// Near and far end of a depth picture, scene units.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,15 +41,25 @@ fn usable(depth: f32) -> bool {
     depth.is_finite() && depth > 0.0
 }
 
-/// Stops of the depth colours, far to near; lightness rises evenly.
-const DEPTH_STOPS: [[f32; 3]; 7] = [
-    [13.0, 14.0, 56.0],
-    [44.0, 35.0, 116.0],
-    [104.0, 44.0, 134.0],
-    [168.0, 56.0, 122.0],
-    [222.0, 89.0, 92.0],
-    [250.0, 155.0, 84.0],
-    [252.0, 236.0, 166.0],
+/// Stops of the depth colours, far to near; OKLab lightness rises from 0.24 to 0.95.
+const DEPTH_STOPS: [[f32; 3]; 17] = [
+    [20.0, 21.0, 77.0],
+    [37.0, 30.0, 101.0],
+    [57.0, 38.0, 124.0],
+    [81.0, 45.0, 144.0],
+    [109.0, 48.0, 153.0],
+    [138.0, 49.0, 151.0],
+    [164.0, 50.0, 140.0],
+    [188.0, 53.0, 125.0],
+    [209.0, 62.0, 107.0],
+    [227.0, 78.0, 91.0],
+    [240.0, 100.0, 79.0],
+    [251.0, 124.0, 73.0],
+    [255.0, 149.0, 77.0],
+    [255.0, 173.0, 92.0],
+    [255.0, 197.0, 112.0],
+    [255.0, 219.0, 133.0],
+    [254.0, 241.0, 161.0],
 ];
 
 /// Colour at `s` in 0..1 between stops.
@@ -55,22 +70,116 @@ fn between(stops: &[[f32; 3]], s: f32) -> [u8; 3] {
     [0, 1, 2].map(|c| (stops[i][c] + (stops[i + 1][c] - stops[i][c]) * f + 0.5) as u8)
 }
 
+/// The depth colours from near to far in `count` steps.
+pub fn depth_ramp(count: usize) -> Vec<[u8; 3]> {
+    (0..count).map(|i| between(&DEPTH_STOPS, 1.0 - i as f32 / (count.max(2) - 1) as f32)).collect()
+}
+
 /// Depth `[height, width]` as a picture. Panics on a wrong count.
 pub fn depth_colours(depth: &[f32], (width, height): (u32, u32), scale: DepthScale) -> Rgb8 {
-    let (lo, hi) = (1.0 / scale.far, 1.0 / scale.near);
+    let (lo, hi) = (ln(scale.near.into()), ln(scale.far.into()));
     let data = depth.iter().flat_map(|&d| match usable(d) {
-        true => between(&DEPTH_STOPS, (1.0 / d - lo) / (hi - lo)),
+        true => between(&DEPTH_STOPS, ((hi - ln(d.into())) / (hi - lo)) as f32),
         false => [0; 3],
     });
     Rgb8::new(width, height, data.collect())
 }
 
-/// The depth colours from near (left) to far (right), linear in inverse depth: a legend.
+/// The depth colours from near (left) to far (right), logarithmic: a legend without numbers.
 pub fn depth_key(width: u32, height: u32, scale: DepthScale) -> Rgb8 {
-    let (lo, hi) = (1.0 / scale.far, 1.0 / scale.near);
-    let steps = (width.max(2) - 1) as f32;
-    let row: Vec<f32> = (0..width).map(|x| 1.0 / (hi + (lo - hi) * x as f32 / steps)).collect();
+    let ratio = f64::from(scale.far) / f64::from(scale.near);
+    let steps = f64::from(width.max(2) - 1);
+    let row: Vec<f32> =
+        (0..width).map(|x| (f64::from(scale.near) * exp(ln(ratio) * f64::from(x) / steps)) as f32).collect();
     depth_colours(&row.repeat(height as usize), (width, height), scale)
+}
+
+/// Background and text of legends and contact sheets.
+pub const INK: ([u8; 3], [u8; 3]) = ([18, 20, 22], [224, 226, 228]);
+
+/// An empty picture.
+pub fn blank(width: u32, height: u32, colour: [u8; 3]) -> Rgb8 {
+    Rgb8::new(width, height, colour.repeat(width as usize * height as usize))
+}
+
+/// Copies a picture into another at `(x, y)`; what lies outside is cut off.
+pub fn paste(to: &mut Rgb8, from: &Rgb8, (x, y): (u32, u32)) {
+    let columns = from.width.min(to.width.saturating_sub(x)) as usize;
+    for row in 0..from.height.min(to.height.saturating_sub(y)) {
+        let (a, b) = (3 * (row * from.width) as usize, 3 * ((y + row) as usize * to.width as usize + x as usize));
+        to.data[b..b + 3 * columns].copy_from_slice(&from.data[a..a + 3 * columns]);
+    }
+}
+
+/// A number with two digits that count: `0.25`, `3.8`, `40`, `1500`.
+fn short(v: f64) -> String {
+    match v {
+        v if v >= 9.95 => format!("{v:.0}"),
+        v if v >= 0.995 => format!("{v:.1}"),
+        v => format!("{v:.2}"),
+    }
+}
+
+/// The depth colours with numbers under them and the unit at the end, 23 pixels high.
+pub fn depth_legend(width: u32, scale: DepthScale, unit: &str) -> Rgb8 {
+    let mut out = blank(width, 23, INK.0);
+    paste(&mut out, &depth_key(width, 12, scale), (0, 0));
+    let ratio = ln(f64::from(scale.far) / f64::from(scale.near));
+    let mut free = 0;
+    // 1, 2, 5, 10, ... as far as they have room.
+    let mut tick = |value: f64, text: &str| {
+        let at = (ln(value / f64::from(scale.near)) / ratio * f64::from(width - 1)).round() as i64;
+        let wide = i64::from(label::width(text, 1));
+        let left = (at - wide / 2).clamp(0, (i64::from(width) - wide).max(0));
+        if left >= free {
+            free = left + wide + 6;
+            paste(&mut out, &blank(1, 3, INK.1), (at.max(0) as u32, 11));
+            label::draw(&mut out, (left, 16), text, INK.1, 1);
+        }
+    };
+    let mut decade = 1e-6;
+    let last = format!("{} {unit}", short(f64::from(scale.far)));
+    let room = exp(ratio * (1.0 - f64::from(label::width(&last, 1) + 14) / f64::from(width))) * f64::from(scale.near);
+    while decade < f64::from(scale.far) {
+        for v in [1.0, 2.0, 5.0].map(|m| m * decade).into_iter().filter(|v| *v >= f64::from(scale.near) && *v < room) {
+            tick(v, &short(v));
+        }
+        decade *= 10.0;
+    }
+    tick(f64::from(scale.far), &last);
+    out
+}
+
+/// The velocity colours as a disc of `side` pixels, the speed of its rim and the direction of its top under it.
+pub fn velocity_legend(side: u32, top: f32, unit: &str) -> Rgb8 {
+    let lines = [format!("rim {} {unit}", short(top.into())), "up = ahead".to_owned(), "white = still".to_owned()];
+    let width = lines.iter().map(|l| label::width(l, 1)).max().unwrap_or(0).max(side);
+    let mut out = blank(width, side + 4 + 10 * lines.len() as u32, INK.0);
+    let disc = velocity_key(side);
+    let left = (width - side) / 2;
+    for y in 0..side {
+        for x in (0..side).filter(|&x| disc.pixel(x, y) != [0; 3]) {
+            let at = 3 * (y * width + left + x) as usize;
+            out.data[at..at + 3].copy_from_slice(&disc.pixel(x, y));
+        }
+    }
+    for (i, line) in lines.iter().enumerate() {
+        label::draw(&mut out, (0, i64::from(side) + 4 + 10 * i as i64), line, INK.1, 1);
+    }
+    out
+}
+
+/// Dynamic probability over a picture: its grays, darkened, turn orange by the probability. Panics on sizes
+/// that differ.
+pub fn dynamic_overlay(picture: &Rgb8, probability: &[f32]) -> Rgb8 {
+    assert_eq!(probability.len() * 3, picture.data.len(), "one probability a pixel");
+    let data = picture.data.chunks_exact(3).zip(probability).flat_map(|(p, &moving)| {
+        let light = (0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])) / 255.0;
+        let moving = if moving.is_finite() { moving.clamp(0.0, 1.0) } else { 0.0 };
+        let (still, strong) = (15.0 + 115.0 * light, 0.55 + 0.45 * light);
+        [255.0, 140.0, 41.0].map(|c| (still + (c * strong - still) * moving + 0.5) as u8)
+    });
+    Rgb8::new(picture.width, picture.height, data.collect())
 }
 
 /// Colour of a hue (radians) and a saturation 0..1 at full brightness.
@@ -150,8 +259,8 @@ mod tests {
     fn depth_is_light_near_dark_far_black_without() {
         let scale = DepthScale { near: 2.0, far: 50.0 };
         let p = depth_colours(&[2.0, 50.0, 0.0, f32::NAN, 1.0, 900.0], (6, 1), scale);
-        assert_eq!(p.pixel(0, 0), [252, 236, 166]);
-        assert_eq!(p.pixel(1, 0), [13, 14, 56]);
+        assert_eq!(p.pixel(0, 0), [254, 241, 161]);
+        assert_eq!(p.pixel(1, 0), [20, 21, 77]);
         assert_eq!([p.pixel(2, 0), p.pixel(3, 0)], [[0; 3]; 2]);
         assert_eq!((p.pixel(4, 0), p.pixel(5, 0)), (p.pixel(0, 0), p.pixel(1, 0)));
         // Lightness falls all the way.
@@ -161,6 +270,72 @@ mod tests {
         let s = DepthScale::of(&(0..1000).map(|i| i as f32).chain([f32::NAN, -4.0]).collect::<Vec<_>>());
         assert!((s.near - 20.0).abs() < 2.0 && (s.far - 979.0).abs() < 2.0, "{s:?}");
         assert!(DepthScale::of(&[]).far > DepthScale::of(&[]).near);
+    }
+
+    /// OKLab of an sRGB colour.
+    fn oklab(c: [f32; 3]) -> [f64; 3] {
+        let linear = |v: f32| {
+            let v = f64::from(v) / 255.0;
+            if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+        };
+        let [r, g, b] = c.map(linear);
+        let root = |x: f64, y: f64, z: f64| (x * r + y * g + z * b).cbrt();
+        let l = root(0.412_221_470_8, 0.536_332_536_3, 0.051_445_992_9);
+        let m = root(0.211_903_498_2, 0.680_699_545_1, 0.107_396_956_6);
+        let s = root(0.088_302_461_9, 0.281_718_837_6, 0.629_978_700_5);
+        [
+            0.210_454_255_3 * l + 0.793_617_785_0 * m - 0.004_072_046_8 * s,
+            1.977_998_495_1 * l - 2.428_592_205_0 * m + 0.450_593_709_9 * s,
+            0.025_904_037_1 * l + 0.782_771_766_2 * m - 0.808_675_766_0 * s,
+        ]
+    }
+
+    #[test]
+    fn depth_stops_are_equal_steps_to_the_eye() {
+        let lab = DEPTH_STOPS.map(oklab);
+        for pair in lab.windows(2) {
+            let step = (0..3).map(|i| (pair[1][i] - pair[0][i]).powi(2)).sum::<f64>().sqrt();
+            assert!((0.050..0.062).contains(&step), "{step}");
+            assert!(pair[1][0] - pair[0][0] > 0.03, "lightness falls: {pair:?}");
+        }
+    }
+
+    #[test]
+    fn depth_is_logarithmic_and_its_legend_agrees() {
+        let scale = DepthScale { near: 1.0, far: 100.0 };
+        let p = depth_colours(&[1.0, 10.0, 100.0], (3, 1), scale);
+        assert_eq!(p.pixel(1, 0), DEPTH_STOPS[8].map(|c| c as u8));
+        let key = depth_key(101, 2, scale);
+        assert_eq!(
+            [key.pixel(0, 0), key.pixel(50, 1), key.pixel(100, 0)],
+            [p.pixel(0, 0), p.pixel(1, 0), p.pixel(2, 0)]
+        );
+        let legend = depth_legend(201, scale, "units");
+        assert_eq!(legend.size(), (201, 23));
+        // A tick at 10, half way, and text under it.
+        assert_eq!(legend.pixel(100, 13), INK.1);
+        assert!((90..112).any(|x| legend.pixel(x, 18) == INK.1));
+        assert_eq!(depth_ramp(17)[0], p.pixel(0, 0));
+        assert_eq!(
+            ["0.25", "1.0", "3.8", "10", "1500"],
+            [0.25, 0.999, 3.84, 9.96, 1500.2].map(short).each_ref().map(String::as_str)
+        );
+    }
+
+    #[test]
+    fn what_moves_is_orange_on_gray() {
+        let picture = blank(4, 1, [100, 150, 200]);
+        let p = dynamic_overlay(&picture, &[0.0, 1.0, 0.5, f32::NAN]);
+        let gray = p.pixel(0, 0);
+        assert!(gray[0] == gray[1] && gray[1] == gray[2]);
+        assert!(p.pixel(1, 0)[0] > 180 && p.pixel(1, 0)[2] < 40, "{:?}", p.pixel(1, 0));
+        assert!(p.pixel(2, 0)[0] > gray[0] && p.pixel(2, 0)[0] < p.pixel(1, 0)[0]);
+        assert_eq!(p.pixel(3, 0), gray);
+        let mut sheet = blank(3, 2, [0; 3]);
+        paste(&mut sheet, &picture, (2, 1));
+        assert_eq!([sheet.pixel(2, 1), sheet.pixel(1, 1), sheet.pixel(2, 0)], [[100, 150, 200], [0; 3], [0; 3]]);
+        let legend = velocity_legend(40, 12.0, "units/s");
+        assert_eq!((legend.pixel(0, 0), legend.height), (INK.0, 74));
     }
 
     #[test]
