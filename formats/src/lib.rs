@@ -26,6 +26,7 @@
 //! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
 //! | `picture.rs`, `label.rs` | depth, velocity and other numbers as pictures with a known scale; small text |
 //! | `scene_io.rs`, `ply.rs` | [`Scene::save`], [`Scene::load`]; splats as PLY and PLY sequences |
+//! | `splat_file.rs`, `apng.rs`, `y4m.rs` | splats as `.splat`; animated PNG; uncompressed video |
 //! | `camera_json.rs`, `poses_io.rs` | camera paths; poses for nerfstudio, TUM, KITTI, COLMAP |
 //! | `sniff.rs`, `json.rs` | what a file is by its content; JSON without equal keys |
 //! | `scene.rs` | [`Scene`]: moving Gaussians; the composition at any time |
@@ -34,6 +35,7 @@
 //! camera, seconds, scene units.
 #![deny(unsafe_code)]
 
+pub mod apng;
 pub mod arch;
 pub mod atomic;
 pub mod blob;
@@ -69,10 +71,12 @@ pub mod scene;
 pub mod scene_io;
 mod setting;
 pub mod sniff;
+pub mod splat_file;
 #[cfg(feature = "pytorch")]
 mod torch_in;
 pub mod transforms;
 mod truth;
+pub mod y4m;
 
 pub use blob::{Blob, Dtype, Layout, LoadMode, TensorRecord, Verify};
 pub use blob_writer::BlobWriter;
