@@ -184,6 +184,17 @@ impl Scene {
         self.gaussians.is_empty()
     }
 
+    /// How Gaussian `i` moves as its own frame knows it, towards later times: v+ in the first frame, which sees
+    /// nothing earlier, -v- in the last, the mean of both in the others.
+    pub fn velocity(&self, i: usize) -> [f32; 3] {
+        let (f, b) = (self.v_fwd[i], self.v_bwd[i]);
+        match self.source[i] as usize {
+            0 => f,
+            s if s + 1 >= self.frames.len() => b.map(|v| -v),
+            _ => [0, 1, 2].map(|a| 0.5 * (f[a] - b[a])),
+        }
+    }
+
     /// First and last input time, seconds.
     pub fn time_range(&self) -> (f64, f64) {
         (self.frames.first().map_or(0.0, |f| f.time), self.frames.last().map_or(0.0, |f| f.time))
@@ -359,6 +370,12 @@ mod tests {
         let total: f32 = g.opacity.iter().sum();
         // Four static shares (3 x 0.1 + 0.9) and frame 1's dynamic share 0.9.
         assert!((total - 0.8 * (0.3 + 0.9 + 0.9)).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_ends_of_a_clip_know_one_direction_of_motion() {
+        let s = scene();
+        assert_eq!([0, 1, 2].map(|i| s.velocity(i)[0]), [1.0, 1.5, 2.0]);
     }
 
     #[test]
