@@ -96,15 +96,6 @@ impl Precision {
     }
 }
 
-/// Image file type of rendered pictures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Picture {
-    /// Lossless
-    Png,
-    /// Small
-    Jpg,
-}
-
 /// Width and height in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Size {

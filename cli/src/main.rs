@@ -14,7 +14,9 @@
 //! | `golden.rs` | the golden run of a blob |
 //! | `scan.rs` | which layers int8 is too coarse for |
 //! | `versus.rs` | one model against another: `compare` and the checks of `convert` |
-//! | `views.rs` | cameras for `render`: along the clip, fixed, in orbit, displaced |
+//! | `views.rs` | cameras for `render`: along the clip, behind it, fixed, in orbit, displaced, following a thing |
+//! | `reals.rs` | the pictures that a scene was made from |
+//! | `video.rs` | animated PNG, y4m, mp4 |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
 #![deny(unsafe_code)]
@@ -27,12 +29,14 @@ mod model;
 mod network;
 mod output;
 mod progress;
+mod reals;
 mod reconstruct;
 mod results;
 mod scan;
 mod signals;
 mod verbs;
 mod versus;
+mod video;
 mod views;
 
 use clap::Parser;

@@ -23,6 +23,11 @@ impl Console {
         Console { json, quiet }
     }
 
+    /// Whether the result is a JSON document on standard output.
+    pub(crate) fn is_json(&self) -> bool {
+        self.json
+    }
+
     /// The command's result, once: the JSON document or the text.
     pub(crate) fn report(&self, json: &Value, text: &str) -> Result<()> {
         if self.json { write_stdout(json_text(json)?.as_bytes()) } else { write_stdout(text.as_bytes()) }

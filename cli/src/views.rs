@@ -11,6 +11,11 @@ use sf_splat::Rendered;
 pub(crate) enum Rig {
     /// The input cameras, interpolated at the time.
     Follow,
+    /// Behind and above the input cameras, looking where they look.
+    Chase {
+        /// Scene units behind, a third of it above; none takes a tenth of the distance to what is seen.
+        back: Option<f64>,
+    },
     /// The camera of one input frame.
     Frame(usize),
     /// One input frame's camera, moved once around a circle of this radius (scene units; half up and
@@ -35,7 +40,7 @@ pub(crate) fn views(scene: &Scene, rig: Rig, times: Option<&[f64]>) -> Result<Ve
     };
     let times: Vec<f64> = match (times, rig) {
         (Some(t), _) => t.to_vec(),
-        (None, Rig::Follow) => scene.frames.iter().map(|f| f.time).collect(),
+        (None, Rig::Follow | Rig::Chase { .. }) => scene.frames.iter().map(|f| f.time).collect(),
         (None, Rig::Frame(i)) => vec![frame(i)?.time],
         (None, Rig::Orbit { frame: i, .. }) => vec![frame(i)?.time; ORBIT_VIEWS],
     };
@@ -43,13 +48,18 @@ pub(crate) fn views(scene: &Scene, rig: Rig, times: Option<&[f64]>) -> Result<Ve
         return Err(Error::input("--times", format!("{t} is not a time in seconds")));
     }
     let n = times.len();
+    // One distance for all views, so that the camera does not swing back and forth.
+    let chased = match rig {
+        Rig::Chase { back: None } => typical_depth(scene, &frame(0)?.camera),
+        _ => 0.0,
+    };
     let view = |(i, &time): (usize, &f64)| {
         let camera = match rig {
-            // Exactly at a frame its own camera, without the interpolation's rounding.
-            Rig::Follow => match scene.frames.iter().find(|f| f.time == time) {
-                Some(f) => f.camera,
-                None => scene.camera_at(time)?,
-            },
+            Rig::Follow => along(scene, time)?,
+            Rig::Chase { back } => {
+                let camera = along(scene, time)?;
+                chase(&camera, back.unwrap_or(0.1 * chased))
+            }
             Rig::Frame(f) => frame(f)?.camera,
             Rig::Orbit { frame: f, radius } => {
                 let camera = frame(f)?.camera;
@@ -63,8 +73,103 @@ pub(crate) fn views(scene: &Scene, rig: Rig, times: Option<&[f64]>) -> Result<Ve
     times.iter().enumerate().map(view).collect()
 }
 
+/// The input camera at a time.
+fn along(scene: &Scene, time: f64) -> Result<Camera> {
+    // Exactly at a frame its own camera, without the interpolation's rounding.
+    match scene.frames.iter().find(|f| f.time == time) {
+        Some(f) => Ok(f.camera),
+        None => scene.camera_at(time),
+    }
+}
+
+/// The camera moved back and up, turned to a point four times as far ahead as it moved back.
+fn chase(camera: &Camera, back: f64) -> Camera {
+    let offset = glam::DVec3::new(0.0, -back / 3.0, -back);
+    let forward = (glam::DVec3::new(0.0, 0.0, 4.0 * back) - offset).normalize();
+    let down = forward.cross(glam::DVec3::X);
+    let step = Pose { r: glam::DMat3::from_cols(glam::DVec3::X, down, forward), t: offset };
+    Camera { pose: camera.pose.then(&step), ..*camera }
+}
+
+/// The camera turned in its place to a point of the world; it keeps its horizon.
+pub(crate) fn aimed(camera: &Camera, point: glam::DVec3) -> Camera {
+    let forward = (point - camera.pose.t).normalize_or_zero();
+    let right = (camera.pose.r * glam::DVec3::Y).cross(forward).normalize_or_zero();
+    if right == glam::DVec3::ZERO {
+        // The point is in the camera, or straight above or below it.
+        return *camera;
+    }
+    let pose = Pose { r: glam::DMat3::from_cols(right, forward.cross(right), forward), t: camera.pose.t };
+    Camera { pose, ..*camera }
+}
+
+/// Where one moving thing is at any time: [`Track::of`] finds it, [`Track::at`] tells.
+#[derive(Clone, Debug)]
+pub(crate) struct Track(Vec<(f64, glam::DVec3)>);
+
+impl Track {
+    /// Follows what source frame `frame` sees at a pixel. The thing is the dynamic Gaussian that is nearest to
+    /// the pixel; from its frame to the next it moves with the mean v+ of its frame's dynamic Gaussians around it (a
+    /// tenth of its depth), to the frame before with their v-, and so on from frame to frame.
+    ///
+    /// # Errors
+    /// Status 3 when the frame does not exist, or nothing dynamic is within a tenth of its width of the pixel.
+    pub(crate) fn of(scene: &Scene, frame: usize, pixel: (f64, f64)) -> Result<Track> {
+        let Some(source) = scene.frames.get(frame) else {
+            let why = format!("frame {frame} does not exist: the scene has {} frames", scene.frames.len());
+            return Err(Error::input("--look-at", why));
+        };
+        let moves = |i: &usize| scene.dynamic[*i] > scene.compose.tau;
+        let place = |i: usize| glam::DVec3::from_array(scene.gaussians.mean[i].map(f64::from));
+        let off = |i: usize| {
+            let (u, v, z) = source.camera.project(place(i));
+            if z > 1e-3 { (u - pixel.0).hypot(v - pixel.1) } else { f64::INFINITY }
+        };
+        let own = (0..scene.len()).filter(|&i| scene.source[i] as usize == frame).filter(moves);
+        let nearest = own.map(|i| (i, off(i))).min_by(|a, b| a.1.total_cmp(&b.1));
+        let Some((start, _)) = nearest.filter(|n| n.1 <= 0.1 * f64::from(source.camera.width)) else {
+            let why = format!("nothing that moves is near pixel {},{} of frame {frame}", pixel.0, pixel.1);
+            return Err(Error::input("--look-at", why));
+        };
+        let radius = 0.1 * source.camera.project(place(start)).2;
+        // Mean velocity around a point in one frame; none where nothing moves there.
+        let drift = |f: usize, at: glam::DVec3, list: &[[f32; 3]]| {
+            let near = (0..scene.len()).filter(|&i| scene.source[i] as usize == f).filter(moves);
+            let near: Vec<usize> = near.filter(|&i| (place(i) - at).length() <= radius).collect();
+            let sum: glam::DVec3 = near.iter().map(|&i| glam::DVec3::from_array(list[i].map(f64::from))).sum();
+            (!near.is_empty()).then(|| sum / near.len() as f64)
+        };
+        let n = scene.frames.len();
+        let mut path = vec![(source.time, place(start))];
+        for (list, frames) in
+            [(&scene.v_fwd, (frame + 1..n).collect::<Vec<_>>()), (&scene.v_bwd, (0..frame).rev().collect::<Vec<_>>())]
+        {
+            let (mut at, mut time, mut here, mut v) = (place(start), source.time, frame, glam::DVec3::ZERO);
+            for next in frames {
+                v = drift(here, at, list).unwrap_or(v);
+                let dt = (scene.frames[next].time - time).abs();
+                (at, time, here) = (at + v * dt, scene.frames[next].time, next);
+                path.push((time, at));
+            }
+        }
+        path.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Ok(Track(path))
+    }
+
+    /// Its place at a time: straight between the frames, and on beyond them.
+    pub(crate) fn at(&self, time: f64) -> glam::DVec3 {
+        let n = self.0.len();
+        if n == 1 {
+            return self.0[0].1;
+        }
+        let hi = self.0.iter().position(|p| p.0 >= time).unwrap_or(n - 1).max(1);
+        let (a, b) = (self.0[hi - 1], self.0[hi]);
+        a.1 + (b.1 - a.1) * ((time - a.0) / (b.0 - a.0))
+    }
+}
+
 /// Median z-depth of the Gaussians in front of a camera; 10 where there are none.
-fn typical_depth(scene: &Scene, camera: &Camera) -> f64 {
+pub(crate) fn typical_depth(scene: &Scene, camera: &Camera) -> f64 {
     let to_camera = camera.pose.inverse();
     // A few thousand give the median well enough.
     let step = (scene.len() / 4096).max(1);
@@ -177,6 +282,51 @@ mod tests {
         let between = views(&s, Rig::Follow, Some(&[0.5, 3.0])).unwrap();
         assert!((between[0].camera.pose.t - DVec3::new(0.0, 0.0, 0.5)).length() < 1e-12);
         assert!((between[1].camera.pose.t - DVec3::new(0.0, 0.0, 3.0)).length() < 1e-12);
+    }
+
+    #[test]
+    fn chasing_stays_behind_and_above_and_looks_ahead() {
+        let s = street();
+        let v = views(&s, Rig::Chase { back: Some(3.0) }, Some(&[0.5])).unwrap();
+        let ego = s.camera_at(0.5).unwrap();
+        let step = ego.pose.inverse().then(&v[0].camera.pose);
+        assert!((step.t - DVec3::new(0.0, -1.0, -3.0)).length() < 1e-12, "{}", step.t);
+        v[0].camera.check("view").unwrap();
+        let (u, w, z) = v[0].camera.project(ego.pose.apply(DVec3::new(0.0, 0.0, 12.0)));
+        assert!((u - 20.0).abs() < 1e-9 && (w - 10.0).abs() < 1e-9 && z > 15.0, "{u} {w} {z}");
+        // A tenth of 8 units without a number.
+        let v = views(&s, Rig::Chase { back: None }, None).unwrap();
+        assert_eq!(v.len(), 3);
+        let step = s.frames[1].camera.pose.inverse().then(&v[1].camera.pose);
+        assert!((step.t.z + 0.8).abs() < 1e-6, "{}", step.t);
+    }
+
+    #[test]
+    fn a_track_goes_with_the_velocities_and_an_aimed_camera_sees_it_in_the_middle() {
+        let mut s = street();
+        // One thing in frame 1 that moves by (1, 0, 0) a second there and (2, 0, 0) in frame 2.
+        let p = s.frames[1].camera.pose.apply(DVec3::new(0.0, 0.0, 8.0));
+        s.gaussians.mean = vec![p.as_vec3().to_array(), (p + DVec3::X).as_vec3().to_array()];
+        let g = &mut s.gaussians;
+        (g.scale, g.quat, g.opacity, g.colour) =
+            (vec![[0.1; 3]; 2], vec![[1.0, 0.0, 0.0, 0.0]; 2], vec![0.8; 2], vec![[0.5; 3]; 2]);
+        (s.v_fwd, s.v_bwd) = (vec![[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], vec![[-1.0, 0.0, 0.0], [-2.0, 0.0, 0.0]]);
+        (s.dynamic, s.source) = (vec![0.9; 2], vec![1, 2]);
+        let track = Track::of(&s, 1, (21.0, 9.0)).unwrap();
+        for (time, x) in [(0.0, -1.0), (0.5, -0.5), (1.0, 0.0), (1.5, 0.5), (2.0, 1.0), (2.5, 1.5)] {
+            assert!((track.at(time) - p - DVec3::new(x, 0.0, 0.0)).length() < 1e-5, "{time}: {}", track.at(time));
+        }
+        let camera = aimed(&s.frames[0].camera, track.at(2.0));
+        camera.check("aimed").unwrap();
+        let (u, v, z) = camera.project(track.at(2.0));
+        assert!((u - 20.0).abs() < 1e-9 && (v - 10.0).abs() < 1e-9 && z > 0.0);
+        assert_eq!(aimed(&camera, camera.pose.t), camera);
+        for (frame, pixel, why) in
+            [(7, (20.0, 10.0), "3 frames"), (0, (20.0, 10.0), "nothing"), (1, (0.0, 0.0), "nothing")]
+        {
+            let e = Track::of(&s, frame, pixel).unwrap_err();
+            assert!(e.status() as i32 == 3 && e.to_string().contains(why), "{e}");
+        }
     }
 
     #[test]
