@@ -14,6 +14,7 @@
 //! | `golden.rs` | the golden run of a blob |
 //! | `scan.rs` | which layers int8 is too coarse for |
 //! | `versus.rs` | one model against another: `compare` and the checks of `convert` |
+//! | `overview.rs` | one sheet of a run's pictures with scales |
 //! | `views.rs` | cameras for `render`: along the clip, behind it, fixed, in orbit, displaced, following a thing |
 //! | `reals.rs` | the pictures that a scene was made from |
 //! | `video.rs` | animated PNG, y4m, mp4 |
@@ -28,6 +29,7 @@ mod golden;
 mod model;
 mod network;
 mod output;
+mod overview;
 mod progress;
 mod reals;
 mod reconstruct;

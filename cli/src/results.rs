@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! DIR/scene.ply, scene.json          the scene
-//! DIR/overview.png                   per frame: picture, depth, motion, dynamic probability
+//! DIR/overview.png                   a sheet of everything with scales, see `overview.rs`
 //! DIR/depth.npy                      [N, H, W] z-depth, scene units
 //! DIR/depth/000000.png               16 bit, depth x 256, 0 = none; 000000_colour.png to look at
 //! DIR/conf.npy                       [N, H, W] confidence logits
@@ -13,13 +13,15 @@
 //! ```
 
 use crate::folder::OutputFolder;
+use crate::overview::overview;
 use clap::ValueEnum;
 use sf_formats::atomic::Overwrite;
 use sf_formats::clip::TruthFrame;
-use sf_formats::image_io::{self, Rgb8};
+use sf_formats::image_io;
 use sf_formats::picture::{self, DepthScale};
 use sf_formats::poses_io::{self, PoseFormat};
 use sf_formats::{Result, Scene, npy};
+use sf_splat::Renderer;
 use std::path::Path;
 use streetforward::{Output, Prepared};
 
@@ -87,7 +89,7 @@ pub(crate) struct Results<'a> {
 
 impl Results<'_> {
     /// Writes what is asked for.
-    pub(crate) fn write(&self, emit: &[Emit], folder: &OutputFolder) -> Result<()> {
+    pub(crate) fn write(&self, emit: &[Emit], folder: &OutputFolder, renderer: &mut Renderer) -> Result<()> {
         let (out, size, n) = (self.out, self.size(), self.pixels());
         let frames = || (0..out.shape.frames).map(|f| (f, f * n..(f + 1) * n));
         for emit in emit {
@@ -104,6 +106,8 @@ impl Results<'_> {
                         let colours = picture::depth_colours(depth, size, scale);
                         image_io::write_png(&pictures.join(format!("{f:06}_colour.png")), &colours, Overwrite::Yes)?;
                     }
+                    let legend = picture::depth_legend(320, scale, "units");
+                    image_io::write_png(&pictures.join("scale.png"), &legend, Overwrite::Yes)?;
                 }
                 Emit::Conf | Emit::Points => {}
                 Emit::Poses => {
@@ -117,6 +121,8 @@ impl Results<'_> {
                         let wheel = picture::velocity_wheel(&velocity[range], size, top);
                         image_io::write_png(&pictures.join(format!("{f:06}.png")), &wheel, Overwrite::Yes)?;
                     }
+                    let legend = picture::velocity_legend(96, top, "units/s");
+                    image_io::write_png(&pictures.join("scale.png"), &legend, Overwrite::Yes)?;
                 }
                 Emit::Dynamic => {
                     let pictures = folder.subfolder("dynamic")?;
@@ -126,50 +132,34 @@ impl Results<'_> {
                     }
                 }
                 Emit::Overview => {
-                    image_io::write_png(&folder.path().join("overview.png"), &self.overview(), Overwrite::Yes)?;
+                    let sheet = overview(self, renderer)?;
+                    image_io::write_png(&folder.path().join("overview.png"), &sheet, Overwrite::Yes)?;
                 }
             }
         }
         Ok(())
     }
 
-    fn size(&self) -> (u32, u32) {
+    /// Width and height of the network's pictures.
+    pub(crate) fn size(&self) -> (u32, u32) {
         (self.out.shape.width as u32, self.out.shape.height as u32)
     }
 
-    fn pixels(&self) -> usize {
+    /// Pixels of a frame.
+    pub(crate) fn pixels(&self) -> usize {
         self.out.shape.width * self.out.shape.height
     }
 
-    /// Motion of every pixel: the mean of v+ and -v-.
-    fn velocity(&self) -> Vec<[f32; 3]> {
-        let both = self.out.v_fwd.iter().zip(&self.out.v_bwd);
-        both.map(|(f, b)| std::array::from_fn(|a| 0.5 * (f[a] - b[a]))).collect()
-    }
-
-    /// A row per frame: picture, depth, true depth, motion, true motion, dynamic probability; without ground
-    /// truth four of them. Predicted and true depth have scales of their own, since a clip without poses
-    /// is known up to scale; motion has one, since it is to be compared.
-    pub(crate) fn overview(&self) -> Rgb8 {
-        let (out, size, n) = (self.out, self.size(), self.pixels());
-        let (scale, velocity) = (DepthScale::of(&out.depth), self.velocity());
-        let moving: Vec<[f32; 3]> =
-            self.truth.iter().filter_map(|t| t.velocity.as_deref()).flatten().copied().collect();
-        let top = picture::top_speed(if moving.is_empty() { &velocity } else { &moving }, 1.0);
-        let truth: Vec<f32> = self.truth.iter().flat_map(|t| &t.depth).copied().collect();
-        let true_scale = DepthScale::of(&truth);
-        let mut cells = Vec::new();
-        for f in 0..out.shape.frames {
-            let range = f * n..(f + 1) * n;
-            cells.push(Rgb8::new(size.0, size.1, self.prepared.images[3 * f * n..3 * (f + 1) * n].to_vec()));
-            let truth = self.truth.get(f).filter(|t| (t.width, t.height) == size);
-            cells.push(picture::depth_colours(&out.depth[range.clone()], size, scale));
-            cells.extend(truth.map(|t| picture::depth_colours(&t.depth, size, true_scale)));
-            cells.push(picture::velocity_wheel(&velocity[range.clone()], size, top));
-            cells.extend(truth.and_then(|t| t.velocity.as_ref()).map(|v| picture::velocity_wheel(v, size, top)));
-            cells.push(picture::gray(&out.dynamic[range], size, (0.0, 1.0)));
-        }
-        let columns = cells.len() / out.shape.frames;
-        picture::grid(&cells.iter().collect::<Vec<_>>(), columns)
+    /// Motion of every pixel as its own frame knows it: as `Scene::velocity`, but for pixels, as static Gaussians of
+    /// the scene may have been merged.
+    pub(crate) fn velocity(&self) -> Vec<[f32; 3]> {
+        let (n, last) = (self.pixels(), self.out.shape.frames - 1);
+        let both = self.out.v_fwd.iter().zip(&self.out.v_bwd).enumerate();
+        both.map(|(i, (f, b))| match i / n {
+            0 => *f,
+            frame if frame == last => b.map(|v| -v),
+            _ => std::array::from_fn(|a| 0.5 * (f[a] - b[a])),
+        })
+        .collect()
     }
 }

@@ -19,6 +19,7 @@ use crate::args::{EngineArgs, FolderArgs, Precision, Shift, path_json};
 use crate::folder::OutputFolder;
 use crate::model;
 use crate::output::{Console, files_json, human_count, json_text};
+use crate::overview::overview;
 use crate::reconstruct;
 use crate::results::Results;
 use crate::views::{self, Rig};
@@ -85,10 +86,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         Some(t) => protocol.context.iter().map(|&i| t.frames[i].clone()).collect(),
         None => Vec::new(),
     };
-    let overview = Results { out, scene: &scene, prepared: &prepared, truth: &known }.overview();
-    image_io::write_png(&folder.path().join("overview.png"), &overview, Overwrite::Yes)?;
-
     let mut renderer = Renderer::new(session.threads())?;
+    let sheet = overview(&Results { out, scene: &scene, prepared: &prepared, truth: &known }, &mut renderer)?;
+    image_io::write_png(&folder.path().join("overview.png"), &sheet, Overwrite::Yes)?;
+
     let mut album = Album { scene: &scene, folder: &folder, renderer: &mut renderer, pictures: 0, total_ms: 0.0 };
     let times = clip.times();
     let along = views::views(&scene, Rig::Follow, Some(&times))?;

@@ -13,6 +13,7 @@ use sf_formats::clip::Clip;
 use sf_formats::digest::hex;
 use sf_formats::error::escape_path;
 use sf_formats::{Error, Intrinsics, Result, Scene, npy};
+use sf_splat::Renderer;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -133,7 +134,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     }
     let mut scene = out.to_scene(config, &reconstruct::sources(&clip));
     scene.notes = loaded.notes(&args.clip.input);
-    Results { out, scene: &scene, prepared: &prepared, truth: &[] }.write(&args.emit, &folder)?;
+    let mut renderer = Renderer::new(session.threads())?;
+    Results { out, scene: &scene, prepared: &prepared, truth: &[] }.write(&args.emit, &folder, &mut renderer)?;
 
     let mut report = json!({
         "schema": "streetforward.run/1",
