@@ -18,6 +18,7 @@
 //! | `views.rs` | cameras for `render`: along the clip, behind it, fixed, in orbit, displaced, following a thing |
 //! | `reals.rs` | the pictures that a scene was made from |
 //! | `video.rs` | animated PNG, y4m, mp4 |
+//! | `html.rs`, `assets/viewer/` | a scene as one page for a browser |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
 #![deny(unsafe_code)]
@@ -26,6 +27,7 @@ mod args;
 mod exit;
 mod folder;
 mod golden;
+mod html;
 mod model;
 mod network;
 mod output;
