@@ -19,6 +19,7 @@
 //! | `reals.rs` | the pictures that a scene was made from |
 //! | `video.rs` | animated PNG, y4m, mp4 |
 //! | `html.rs`, `assets/viewer/` | a scene as one page for a browser |
+//! | `report.rs` | results as tables and charts on one page |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
 #![deny(unsafe_code)]
@@ -35,6 +36,7 @@ mod overview;
 mod progress;
 mod reals;
 mod reconstruct;
+mod report;
 mod results;
 mod scan;
 mod signals;
@@ -99,6 +101,7 @@ mod tests {
     fn documented_commands_parse() {
         for (name, text) in [
             ("README.md", include_str!("../../README.md")),
+            ("docs/pictures.md", include_str!("../../docs/pictures.md")),
             ("tests/data/drive/README.md", include_str!("../../tests/data/drive/README.md")),
         ] {
             let list = commands(text);

@@ -105,7 +105,7 @@ fn every_buffer_is_written_and_means_what_it_says() {
         "--times",
         "0.5",
         "--buffers",
-        "rgb,depth,alpha,velocity",
+        "rgb,depth,depth-sum,alpha,velocity,dynamic",
         "--format",
         "jpg",
         "--threads",
@@ -120,9 +120,14 @@ fn every_buffer_is_written_and_means_what_it_says() {
             "cameras.json",
             "depth/000000.npy",
             "depth/000000.png",
+            "depth/scale.png",
+            "depth-sum/000000.npy",
+            "dynamic/000000.png",
+            "dynamic/000000_overlay.png",
             "rgb/000000.jpg",
             "velocity/000000.npy",
-            "velocity/000000.png"
+            "velocity/000000.png",
+            "velocity/scale.png"
         ]
     );
     let (shape, depth) = npy::read_f32(&out.join("depth/000000.npy")).unwrap();
@@ -133,8 +138,287 @@ fn every_buffer_is_written_and_means_what_it_says() {
     let (shape, velocity) = npy::read_f32(&out.join("velocity/000000.npy")).unwrap();
     assert_eq!(shape, [32, 48, 3]);
     let at = |row: usize, column: usize| velocity[(row * 48 + column) * 3];
-    assert!(at(16, 24) > 1.5, "{}", at(16, 24));
+    assert!(at(16, 24) > 1.8, "{}", at(16, 24));
     assert_eq!(at(3, 4), 0.0);
+    let (_, sum) = npy::read_f32(&out.join("depth-sum/000000.npy")).unwrap();
+    // Expected depth is the sum over the coverage, which is below 1.
+    assert!(sum.iter().zip(&depth).all(|(s, d)| s <= d) && sum[16 * 48 + 24] < depth[16 * 48 + 24]);
+    let read = |name: &str| image_io::read(&out.join(name), image_io::Orientation::Ignore).unwrap();
+    let dynamic = read("dynamic/000000.png");
+    // The ball's probability is 0.9, the wall's 0.1; a little of the wall shines through.
+    assert!(dynamic.pixel(24, 16)[0].abs_diff(222) < 10 && dynamic.pixel(4, 3)[0].abs_diff(26) < 2);
+    let overlay = read("dynamic/000000_overlay.png");
+    assert!(overlay.pixel(24, 16)[0] > overlay.pixel(24, 16)[2] + 60, "orange: {:?}", overlay.pixel(24, 16));
+}
+
+/// A clip for the scene: every source picture and one between each two, of one colour each.
+fn clip(dir: &Path) -> PathBuf {
+    let folder = dir.join("clip");
+    fs::create_dir(&folder).unwrap();
+    for (i, name) in ["000000", "000000b", "000001", "000001b", "000002"].iter().enumerate() {
+        let image = image_io::Rgb8::new(96, 64, [50 * i as u8, 100, 150].repeat(96 * 64));
+        image_io::write_png(&folder.join(format!("{name}.png")), &image, Overwrite::No).unwrap();
+    }
+    folder
+}
+
+/// A text field of a y4m header.
+fn y4m_header(bytes: &[u8]) -> &str {
+    std::str::from_utf8(&bytes[..bytes.iter().position(|&b| b == b'\n').unwrap()]).unwrap()
+}
+
+/// A PNG file without its animation chunks.
+fn without_animation(bytes: &[u8]) -> Vec<u8> {
+    let (mut out, mut at) = (bytes[..8].to_vec(), 8);
+    while at < bytes.len() {
+        let length = u32::from_be_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        if ![b"acTL", b"fcTL", b"fdAT"].iter().any(|kind| bytes[at + 4..at + 8] == kind[..]) {
+            out.extend(&bytes[at..at + 12 + length]);
+        }
+        at += 12 + length;
+    }
+    out
+}
+
+#[test]
+fn animations_show_the_buffers_side_by_side() {
+    let (dir, scene) = saved();
+    let clip = clip(dir.path());
+    let video = dir.path().join("out.y4m");
+    let buffers = ["--times", "0:1:0.25", "--buffers", "real,rgb,depth,dynamic", "--clip", s(&clip)];
+    let json = ok_json(&[&["render", "-s", s(&scene), "-o", s(&video)], &buffers[..]].concat());
+    assert_eq!((json["format"].as_str(), json["fps"].as_f64()), (Some("y4m"), Some(4.0)));
+    let bytes = fs::read(&video).unwrap();
+    let (width, frame) = (4 * 48 + 3 * 4, (4 * 48 + 3 * 4) * 32 * 3 / 2);
+    assert_eq!(y4m_header(&bytes), format!("YUV4MPEG2 W{width} H32 F4:1 Ip A1:1 C420jpeg XCOLORRANGE=LIMITED"));
+    let body = &bytes[y4m_header(&bytes).len() + 1..];
+    assert_eq!(body.len(), 5 * (6 + frame));
+    // The real pictures by their luma: 50 more red each time.
+    for (i, f) in body.chunks(6 + frame).enumerate() {
+        let want = 16.0 + (65.481 * 50.0 * i as f64 + 128.553 * 100.0 + 24.966 * 150.0) / 255.0;
+        assert!((f64::from(f[6 + 10 * width + 20]) - want).abs() < 1.0, "picture {i}");
+    }
+    // The same bytes on standard output, where nothing else may be.
+    let mut args = vec!["render", "-s", s(&scene), "-o", "-", "--format", "y4m"];
+    args.extend(buffers);
+    let out = common::command(&args).output().unwrap();
+    assert!(out.status.success() && out.stdout == bytes && !out.stderr.is_empty());
+
+    let png = dir.path().join("out.apng");
+    ok(&["render", "-s", s(&scene), "-o", s(&png), "--times", "0:1:0.5", "--fps", "8"]);
+    let bytes = fs::read(&png).unwrap();
+    let chunk = bytes.windows(4).position(|w| w == b"acTL").expect("an animation");
+    assert_eq!(bytes[chunk + 4..chunk + 12], [0, 0, 0, 3, 0, 0, 0, 0], "three pictures, for ever");
+    // A reader that knows no animation sees the first picture.
+    let first = image_io::decode(&without_animation(&bytes), "first", image_io::Orientation::Ignore).unwrap();
+    let folder = dir.path().join("pictures");
+    ok(&["render", "-s", s(&scene), "-o", s(&folder), "--times", "0"]);
+    let want = image_io::read(&folder.join("rgb/000000.png"), image_io::Orientation::Ignore).unwrap();
+    assert_eq!(first.image, want);
+    let few = dir.path().join("few.apng");
+    ok(&["render", "-s", s(&scene), "-o", s(&few), "--times", "0:1:0.5", "--colours", "16"]);
+    assert!(fs::metadata(&few).unwrap().len() < bytes.len() as u64);
+    // Existing files stay.
+    assert!(fails(6, &["render", "-s", s(&scene), "-o", s(&few)]).contains("--force"));
+    ok(&["render", "-s", s(&scene), "-o", s(&few), "--force"]);
+}
+
+/// A folder with an executable script named ffmpeg.
+#[cfg(unix)]
+fn fake_ffmpeg(dir: &Path, script: &str) -> PathBuf {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = dir.join(format!("bin{}", script.len()));
+    fs::create_dir_all(&folder).unwrap();
+    let file = folder.join("ffmpeg");
+    fs::write(&file, format!("#!/bin/sh\n{script}\n")).unwrap();
+    fs::set_permissions(&file, fs::Permissions::from_mode(0o755)).unwrap();
+    folder
+}
+
+#[cfg(unix)]
+#[test]
+fn mp4_goes_through_ffmpeg_and_says_so_where_it_is_missing() {
+    let (dir, scene) = saved();
+    let video = dir.path().join("out.mp4");
+    let call = |path: &str, extra: &[&str]| {
+        let mut args = vec!["render", "-s", s(&scene), "-o", s(&video), "--times", "0:1:0.5"];
+        args.extend(extra);
+        common::ran(common::command(&args).env("PATH", path).output().unwrap())
+    };
+    let empty = dir.path().join("empty");
+    fs::create_dir(&empty).unwrap();
+    let r = call(s(&empty), &[]);
+    assert!(r.code == 7 && r.stderr.contains("ffmpeg") && r.stderr.contains("y4m"), "{} {}", r.code, r.stderr);
+    // Fails at once, and after all pictures.
+    for script in
+        ["echo noise >&2; echo 'Unknown encoder' >&2; exit 3", "cat > /dev/null; echo 'No space here' >&2; exit 1"]
+    {
+        let bin = fake_ffmpeg(dir.path(), script);
+        let r = call(&format!("{}:/usr/bin:/bin", s(&bin)), &[]);
+        assert!(r.code == 6 && (r.stderr.contains("Unknown encoder") || r.stderr.contains("No space")), "{}", r.stderr);
+        assert!(!video.exists());
+    }
+    // What reaches the program is the y4m file, and its arguments name no more than the temporary file.
+    let bin = fake_ffmpeg(dir.path(), "for last; do :; done\nprintf '%s\\n' \"$@\" > \"$last.args\"\ncat > \"$last\"");
+    let path = format!("{}:/usr/bin:/bin", s(&bin));
+    let r = call(&path, &[]);
+    assert_eq!(r.code, 0, "{}", r.stderr);
+    let y4m = dir.path().join("same.y4m");
+    ok(&["render", "-s", s(&scene), "-o", s(&y4m), "--times", "0:1:0.5"]);
+    assert_eq!(fs::read(&video).unwrap(), fs::read(&y4m).unwrap());
+    let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert!(!left.iter().any(|n| n.to_string_lossy().ends_with(".tmp")), "{left:?}");
+    assert!(call(&path, &[]).stderr.contains("--force"));
+    assert_eq!(call(&path, &["--force"]).code, 0);
+}
+
+#[test]
+fn flags_of_render_that_do_not_go_together() {
+    let (dir, scene) = saved();
+    let out = dir.path().join("out");
+    for (args, why) in [
+        (&["--buffers", "real"][..], "--clip"),
+        (&["--clip", "x"], "--buffers real"),
+        (&["--fps", "5"], "animation"),
+        (&["--colours", "9"], "apng"),
+        (&["--format", "apng", "--buffers", "depth-sum"], "arrays"),
+    ] {
+        let line = fails(2, &[&["render", "-s", s(&scene), "-o", s(&out)], args].concat());
+        assert!(line.contains(why), "{args:?}: {line}");
+    }
+    assert!(fails(2, &["render", "-s", s(&scene), "-o", "-"]).contains("y4m"));
+    assert!(fails(2, &["render", "-s", s(&scene), "-o", "-", "--format", "mp4"]).contains("y4m"));
+    fails(2, &["render", "-s", s(&scene), "-o", s(&out), "--chase=0"]);
+    fails(2, &["render", "-s", s(&scene), "-o", s(&out), "--chase", "--frame", "1"]);
+    fails(2, &["render", "-s", s(&scene), "-o", s(&out), "--format", "apng", "--fps", "0"]);
+    // A clip of other pictures.
+    let other = dir.path().join("other");
+    fs::create_dir(&other).unwrap();
+    let image = image_io::Rgb8::new(20, 20, vec![0; 1200]);
+    image_io::write_png(&other.join("a.png"), &image, Overwrite::No).unwrap();
+    let line = fails(3, &["render", "-s", s(&scene), "-o", s(&out), "--buffers", "real", "--clip", s(&other)]);
+    assert!(line.contains("000000.png"), "{line}");
+    assert!(!out.exists());
+    // An animation needs one size.
+    let (a, b) = (dir.path().join("a"), dir.path().join("b"));
+    ok(&["render", "-s", s(&scene), "-o", s(&a), "--times", "0,0.5"]);
+    let text = fs::read_to_string(a.join("cameras.json")).unwrap();
+    fs::write(&b, text.replacen("\"width\": 48", "\"width\": 50", 1)).unwrap();
+    let video = dir.path().join("v.apng");
+    let line = fails(3, &["render", "-s", s(&scene), "-o", s(&video), "--path", s(&b)]);
+    assert!(line.contains("50x32") && !video.exists(), "{line}");
+}
+
+#[test]
+fn cameras_follow_behind_and_turn_to_what_moves() {
+    let (dir, scene) = saved();
+    let behind = dir.path().join("behind");
+    ok(&["render", "-s", s(&scene), "-o", s(&behind), "--chase=3", "--times", "0.5"]);
+    let json: serde_json::Value = serde_json::from_slice(&fs::read(behind.join("cameras.json")).unwrap()).unwrap();
+    let row = |i: usize| json["cameras"][0]["camera_to_world"][i][3].as_f64().unwrap();
+    assert!((row(1) + 1.0).abs() < 1e-9 && (row(2) - (0.2 - 3.0)).abs() < 1e-9, "{} {}", row(1), row(2));
+    // The ball stays in the middle column while it moves.
+    let follow = dir.path().join("follow");
+    ok(&["render", "-s", s(&scene), "-o", s(&follow), "--frame", "0", "--times", "0:1:0.25", "--look-at", "24,16@1"]);
+    for i in 0..5 {
+        let got = ball_column(&follow.join(format!("rgb/{i:06}.png")));
+        assert!(got.abs_diff(24) <= 1, "view {i}: column {got}");
+    }
+    let none = dir.path().join("none");
+    assert!(fails(3, &["render", "-s", s(&scene), "-o", s(&none), "--look-at", "2,2"]).contains("nothing"));
+    fails(2, &["render", "-s", s(&scene), "-o", s(&none), "--look-at", "2"]);
+}
+
+/// Root mean square difference as PSNR, dB.
+fn psnr(a: &[f32], b: &[f32]) -> f64 {
+    let square: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    -10.0 * (square / a.len() as f64).log10()
+}
+
+#[test]
+fn an_exported_ply_draws_the_same_picture_when_read_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("street");
+    ok(&["synth", "--seed", "17", "--frames", "8", "--size", "126x84", "--scene", s(&path)]);
+    let (scene, _) = Scene::load(&path).unwrap();
+    let mut renderer = sf_splat::Renderer::new(2).unwrap();
+    let mut picture = |g: &Gaussians, camera: &Camera| {
+        renderer.render(g, camera, &scene.splat, &sf_splat::RenderOptions::default()).unwrap().rgb
+    };
+    for (name, time, flags) in [("moment", 0.25, &["--at", "0.25"][..]), ("static", 0.0, &["--static-only"])] {
+        let file = dir.path().join(format!("{name}.ply"));
+        ok(&[&["export", "-s", s(&path), "-o", s(&file)], flags].concat());
+        let (back, report) = Scene::load(&file).unwrap();
+        assert_eq!(report.dropped(), 0);
+        let mut rules = scene.compose;
+        let camera = scene.camera_at(time).unwrap();
+        let mut still = scene.clone();
+        if name == "static" {
+            // No dynamic splat exists in a frame that the scene does not have.
+            still.source.iter_mut().for_each(|f| *f = 99);
+            rules.window = 1;
+        }
+        let want = picture(&still.at(time, &rules).unwrap(), &camera);
+        let got = picture(&back.gaussians, &camera);
+        assert!(psnr(&got, &want) > 70.0, "{name}: {} dB", psnr(&got, &want));
+    }
+}
+
+#[test]
+fn a_true_scene_looks_like_its_clip() {
+    let dir = tempfile::tempdir().unwrap();
+    let (clip, scene, out) = (dir.path().join("clip"), dir.path().join("scene"), dir.path().join("out"));
+    let json =
+        ok_json(&["synth", "--seed", "17", "--frames", "6", "--size", "126x84", "-o", s(&clip), "--scene", s(&scene)]);
+    assert_eq!(json["scene_gaussians"], 2 * 126 * 84);
+    ok(&["render", "-s", s(&scene), "-o", s(&out), "--buffers", "rgb,real", "--clip", s(&clip)]);
+    for i in 0..2 {
+        let unit = |kind: &str| {
+            let file = out.join(format!("{kind}/{i:06}.png"));
+            let image = image_io::read(&file, image_io::Orientation::Ignore).unwrap();
+            image.data.iter().map(|&b| f32::from(b) / 255.0).collect::<Vec<_>>()
+        };
+        let quality = psnr(&unit("rgb"), &unit("real"));
+        assert!(quality > 22.0, "frame {i}: {quality} dB");
+    }
+}
+
+#[test]
+fn other_viewers_get_splats_of_32_bytes_and_a_page_that_needs_no_network() {
+    let (dir, scene) = saved();
+    let file = dir.path().join("still.splat");
+    assert_eq!(ok_json(&["export", "-s", s(&scene), "-o", s(&file), "--at", "0.25"])["format"], "splat");
+    assert_eq!(fs::metadata(&file).unwrap().len(), 32 * 223);
+    let page = dir.path().join("page.html");
+    let clip = clip(dir.path());
+    let title = "A <b>street</b> & {{scene}}";
+    let json = ok_json(&["export", "-s", s(&scene), "-o", s(&page), "--clip", s(&clip), "--title", title]);
+    // Three source frames and one time between each two.
+    assert_eq!((json["gaussians"].as_u64(), json["pictures"].as_u64()), (Some(224), Some(5)));
+    let text = fs::read_to_string(&page).unwrap();
+    assert!(!text.contains("http://") && !text.contains("https://"), "the page names a network address");
+    assert!(!text.contains("<b>street"), "the title is text");
+    let between = |start: &str| text.split(start).nth(1).unwrap().split("</script>").next().unwrap();
+    let info: serde_json::Value =
+        serde_json::from_str(between("<script type=\"application/json\" id=\"scene\">")).unwrap();
+    assert_eq!((info["static"].as_u64(), info["moving"].as_u64()), (Some(221), Some(3)));
+    assert_eq!(info["title"], title);
+    let pictures = info["pictures"].as_array().unwrap();
+    assert_eq!(pictures.iter().map(|p| p["time"].as_f64().unwrap()).collect::<Vec<_>>(), [0.0, 0.25, 0.5, 0.75, 1.0]);
+    assert!(pictures.iter().all(|p| p["real"].is_string() && p["psnr_db"].is_f64()));
+    // 27 bytes a splat and 14 more for one that moves, sections in steps of four.
+    let up = |n: usize| n.next_multiple_of(4);
+    let bytes = 224 * 12 + up(224 * 6) + 224 * 8 + up(224) + up(3 * 12) + up(3 * 2);
+    assert_eq!(between("<script type=\"text/plain\" id=\"splats\">").len(), bytes.div_ceil(3) * 4);
+    assert!(fails(6, &["export", "-s", s(&scene), "-o", s(&page)]).contains("--force"));
+    // Without the clip the rendered pictures alone; nothing faint.
+    let json = ok_json(&["export", "-s", s(&scene), "-o", s(&page), "--force", "--min-opacity", "0.99"]);
+    assert_eq!(json["gaussians"], 0);
+    fails(2, &["export", "-s", s(&scene), "-o", s(&page), "--format", "html", "--at", "1"]);
+    fails(2, &["export", "-s", s(&scene), "-o", "x.ply", "--clip", "y"]);
+    let plain = dir.path().join("plain.ply");
+    ok(&["export", "-s", s(&scene), "-o", s(&plain)]);
+    assert!(fails(3, &["export", "-s", s(&plain), "-o", s(&dir.path().join("n.html"))]).contains("cameras"));
 }
 
 #[test]
@@ -322,4 +606,35 @@ fn an_output_folder_with_files_is_refused_and_kept() {
     assert_eq!(files(&out).len(), before.len() + 1);
     // A file in the way.
     fails(6, &["render", "-s", s(&scene), "-o", s(&scene.join("scene.ply"))]);
+}
+
+#[test]
+fn a_report_shows_results_and_scenes_on_one_page() {
+    let (dir, scene) = saved();
+    let clip = clip(dir.path());
+    let rendered = dir.path().join("render.json");
+    let text = ok(&["render", "-s", s(&scene), "-o", s(&dir.path().join("out")), "--times", "0:1:0.1", "--json"]);
+    fs::write(&rendered, text).unwrap();
+    let page = dir.path().join("report.html");
+    let json = ok_json(&["report", s(&rendered), s(&scene), "--clip", s(&clip), "-o", s(&page), "--title", "A & B"]);
+    assert_eq!(json["sections"], 2);
+    let text = fs::read_to_string(&page).unwrap();
+    assert!(!text.contains("http://") && !text.contains("https://"));
+    for part in ["A &amp; B", "11 samples", "224 Gaussians, 3 of them moving", "never seen: real", "data:image/jpeg"] {
+        assert!(text.contains(part), "{part}");
+    }
+    assert!(fails(6, &["report", s(&rendered), "-o", s(&page)]).contains("--force"));
+    let bad = dir.path().join("bad.json");
+    let out = dir.path().join("none.html");
+    for (content, why) in [("{", "not JSON"), ("[1]", "schema"), ("{\"a\": 1}", "schema")] {
+        fs::write(&bad, content).unwrap();
+        let line = fails(3, &["report", s(&bad), "-o", s(&out)]);
+        assert!(line.contains(why) && line.contains("bad.json"), "{line}");
+    }
+    let empty = dir.path().join("empty");
+    fs::create_dir(&empty).unwrap();
+    assert!(fails(3, &["report", s(&empty), "-o", s(&out)]).contains("no result"));
+    fails(2, &["report", "-o", s(&out)]);
+    fails(6, &["report", s(&dir.path().join("missing.json")), "-o", s(&out)]);
+    assert!(!out.exists());
 }

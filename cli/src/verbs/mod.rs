@@ -9,6 +9,7 @@ mod export;
 mod init;
 mod inspect;
 mod render;
+mod report;
 mod run;
 mod synth;
 mod verify;
@@ -31,6 +32,8 @@ pub(crate) enum Verb {
     Render(render::Args),
     /// Write a scene as files that other tools open
     Export(export::Args),
+    /// Put results and scenes on one page to read
+    Report(report::Args),
     /// Tell what is in a checkpoint, weight blob, splat file or scene folder
     Inspect(inspect::Args),
     /// Check a weight blob: structure and every digest
@@ -55,6 +58,7 @@ impl Verb {
             Verb::Run(args) => run::run(args, console),
             Verb::Render(args) => render::run(args, console),
             Verb::Export(args) => export::run(args, console),
+            Verb::Report(args) => report::run(args, console),
             Verb::Inspect(args) => inspect::run(args, console),
             Verb::Verify(args) => verify::run(args, console),
             Verb::Eval(args) => eval::run(args, console),
