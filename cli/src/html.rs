@@ -15,6 +15,7 @@ use sf_formats::image_io::{self, Rgb8};
 use sf_formats::picture::{self, DepthScale};
 use sf_formats::{Error, Result, Scene};
 use sf_splat::{RenderOptions, Renderer};
+use std::path::Path;
 
 const PAGE: &str = include_str!("../assets/viewer/page.html");
 const STYLE: &str = include_str!("../assets/viewer/style.css");
@@ -100,11 +101,18 @@ pub(crate) fn strip(scene: &Scene, reals: Option<&Reals>, threads: usize) -> Res
     Ok(list)
 }
 
+/// A scene and the pictures of its clip, if that is given, as a page; gives the page and the number of pictures.
+pub(crate) fn of_scene(scene: &Scene, clip: Option<&Path>, title: &str, threads: usize) -> Result<(String, usize)> {
+    let reals = clip.map(|clip| Reals::open(clip, scene)).transpose()?;
+    let strip = strip(scene, reals.as_ref(), threads)?;
+    Ok((page(scene, title, &strip)?, strip.len()))
+}
+
 /// The page's text.
 ///
 /// # Errors
 /// Status 3 for a scene without frames, or with more than 65535.
-pub(crate) fn page(scene: &Scene, title: &str, strip: &[StripPicture]) -> Result<String> {
+fn page(scene: &Scene, title: &str, strip: &[StripPicture]) -> Result<String> {
     if scene.frames.is_empty() {
         return Err(Error::input("html", "the scene has no cameras: only a scene folder has them"));
     }

@@ -132,21 +132,30 @@ fn stages(list: &Value) -> Vec<(String, f64)> {
     list.as_array().into_iter().flatten().filter_map(entry).filter(|s| s.1 > 0.0).collect()
 }
 
-/// Stacked bars, one a line, with one scale; each line has a label, a total and its stages.
-fn bars(lines: &[(String, f64, Vec<(String, f64)>)]) -> String {
-    let most = lines.iter().map(|l| l.2.iter().map(|s| s.1).sum::<f64>().max(l.1)).fold(0.0, f64::max);
+/// A line of [`bars`].
+struct Bar {
+    label: String,
+    /// Milliseconds of all.
+    total: f64,
+    /// Name and milliseconds of the parts.
+    parts: Vec<(String, f64)>,
+}
+
+/// Stacked bars, one a line, with one scale.
+fn bars(lines: &[Bar]) -> String {
+    let most = lines.iter().map(|l| l.parts.iter().map(|s| s.1).sum::<f64>().max(l.total)).fold(0.0, f64::max);
     if most <= 0.0 {
         return String::new();
     }
     let mut names: Vec<&str> = Vec::new();
-    for (name, _) in lines.iter().flat_map(|l| &l.2) {
+    for (name, _) in lines.iter().flat_map(|l| &l.parts) {
         if !names.contains(&name.as_str()) {
             names.push(name);
         }
     }
     let colour = |name: &str| COLOURS[names.iter().position(|n| *n == name).unwrap_or(0) % COLOURS.len()];
     let mut svg = format!("<svg viewBox=\"0 0 960 {}\" role=\"img\">", 34 * lines.len());
-    for (i, (label, total, parts)) in lines.iter().enumerate() {
+    for (i, Bar { label, total, parts }) in lines.iter().enumerate() {
         let y = 34 * i;
         let _ = write!(svg, "<text class=\"strong\" x=\"0\" y=\"{}\">{}</text>", y + 20, escape(label));
         let mut x = 250.0;
@@ -213,11 +222,13 @@ fn samples(ms: &[f64], what: &str, deadline: Option<f64>) -> String {
         let row = usize::from(x < free[0]);
         free[row] = x + 7.0 * label.len() as f64;
         let y = 28 - 14 * row;
+        // Labels near the right end stand on the left of their line.
+        let (at, anchor) = if x > 820.0 { (x - 4.0, "end") } else { (x + 4.0, "start") };
         let _ = write!(
             svg,
-            "<line class=\"mark\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{}\" y2=\"160\"/><text x=\"{:.1}\" y=\"{y}\">{label}</text>",
+            "<line class=\"mark\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{}\" y2=\"160\"/>\
+             <text x=\"{at:.1}\" y=\"{y}\" text-anchor=\"{anchor}\">{label}</text>",
             y + 4,
-            x + 4.0
         );
     };
     // Ten samples beyond a percentile's neighbourhood, as the benchmark demands.
@@ -247,8 +258,7 @@ fn bench(v: &Value) -> String {
         ("isa", "isa"),
         ("threads", "threads"),
         ("frames", "frames"),
-        ("width", "width"),
-        ("height", "height"),
+        ("size", "size"),
         ("runs", "runs"),
         ("min_ms", "min ms"),
         ("p50_ms", "p50 ms"),
@@ -261,6 +271,7 @@ fn bench(v: &Value) -> String {
     ];
     let cell = |r: &Value, key: &str| match key {
         "peak_rss_bytes" => r[key].as_f64().map(|b| short(b / f64::from(1 << 20))),
+        "size" => r["width"].as_u64().zip(r["height"].as_u64()).map(|(w, h)| format!("{w}x{h}")),
         _ => scalar(&r[key]),
     };
     // Columns that nothing fills are left out.
@@ -275,8 +286,9 @@ fn bench(v: &Value) -> String {
             [part("preset", "").or(part("model", "")), part("precision", ""), threads, part("frames", " frames")];
         parts.into_iter().flatten().collect::<Vec<_>>().join(" ")
     };
-    let lines: Vec<_> =
-        results.iter().map(|r| (name(r), r["p50_ms"].as_f64().unwrap_or(0.0), stages(&r["stages"]))).collect();
+    let bar =
+        |r: &&Value| Bar { label: name(r), total: r["p50_ms"].as_f64().unwrap_or(0.0), parts: stages(&r["stages"]) };
+    let lines: Vec<Bar> = results.iter().map(bar).collect();
     let mut out = table(&heads, &rows) + "<h3>Stages</h3>" + &bars(&lines);
     for r in &results {
         let ms: Vec<f64> = match (r["samples_ms"].as_array(), r["samples_ns"].as_array()) {
@@ -286,7 +298,7 @@ fn bench(v: &Value) -> String {
         };
         let chart = samples(&ms, "run", r["deadline_ms"].as_f64().or(v["deadline_ms"].as_f64()));
         if !chart.is_empty() {
-            let _ = write!(out, "<h3>{}</h3>{chart}", name(r));
+            out.push_str(&chart.replacen("<h3>", &format!("<h3>{}: ", name(r)), 1));
         }
     }
     out
@@ -310,7 +322,7 @@ fn session(v: &Value) -> String {
     let heads: Vec<&str> = used.iter().map(|f| f.0).collect();
     let facts = table(&heads, &[used.iter().map(|f| f.1.clone()).collect()]);
     let total = v["run_ms"].as_f64().unwrap_or(0.0);
-    facts + "<h3>Stages</h3>" + &bars(&[("network".into(), total, stages(&v["session"]["stages"]))])
+    facts + "<h3>Stages</h3>" + &bars(&[Bar { label: "network".into(), total, parts: stages(&v["session"]["stages"]) }])
 }
 
 /// Metrics of the model beside ablations and baselines.

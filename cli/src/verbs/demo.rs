@@ -5,8 +5,9 @@
 //! Frames 0, 5, 10 and 15 go through the network; the other 16 judge what comes out.
 //!
 //! ```text
+//! DIR/street.html         the moving street for a browser
 //! DIR/overview.png        per context frame: picture, depth and true depth, motion and true motion, dynamic
-//!                         probability
+//!                         probability, the scene drawn at its time, half a step later and from the right
 //! DIR/novel/*.png         the street at all 20 times, 16 of them never seen
 //! DIR/aside/*.png         the same from a metre to the right
 //! DIR/orbit/*.png         time stands still, the camera circles
@@ -17,6 +18,7 @@
 
 use crate::args::{EngineArgs, FolderArgs, Precision, Shift, path_json};
 use crate::folder::OutputFolder;
+use crate::html;
 use crate::model;
 use crate::output::{Console, files_json, human_count, json_text};
 use crate::overview::overview;
@@ -101,6 +103,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let middle = Rig::Orbit { frame: scene.frames.len() / 2, radius: None };
     album.write("orbit", &views::views(&scene, middle, None)?)?;
     let render_ms = album.total_ms / album.pictures as f64;
+    let (page, _) = html::of_scene(&scene, Some(&clip_folder), &format!("Street {seed}"), session.threads())?;
+    atomic::write(&folder.path().join("street.html"), page.as_bytes(), Overwrite::Yes)?;
 
     let options = EvalOptions::new(protocol);
     let scores = evaluate(&EvalClip::new(&clip, truth.as_ref()), &scene, &mut renderer, &options)?;
@@ -141,7 +145,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     ));
     text.push_str(&scores.to_markdown());
     text.push_str(&format!(
-        "\nLook at {shown}/overview.png   picture, depth, true depth, motion, true motion, dynamic probability\n        \
+        "\nLook at {shown}/street.html    in a browser: the street with a time slider and a free camera\n        \
+         {shown}/overview.png   what the network saw and made of it, beside the truth\n        \
          {shown}/novel/         the street at 20 times, 16 of them never seen\n        \
          {shown}/aside/         the same from {ASIDE} unit to the right\n        \
          {shown}/orbit/         time stands still, the camera circles\n        \

@@ -4,7 +4,6 @@ use crate::args::{FolderArgs, Times, has_extension, path_json};
 use crate::folder::OutputFolder;
 use crate::html;
 use crate::output::{Console, files_json, human_bytes};
-use crate::reals::Reals;
 use crate::signals;
 use clap::ValueEnum;
 use serde_json::json;
@@ -158,15 +157,14 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
             // The file is claimed before the pictures are drawn.
             signals::guard_file(&args.output);
             let mut file = AtomicFile::create(&args.output, overwrite)?;
-            let reals = args.clip.as_deref().map(|clip| Reals::open(clip, &scene)).transpose()?;
-            let strip = html::strip(&scene, reals.as_ref(), crate::args::threads(0))?;
-            let page = html::page(&scene, &title, &strip)?;
+            let threads = crate::args::threads(0);
+            let (page, pictures) = html::of_scene(&scene, args.clip.as_deref(), &title, threads)?;
             AtomicFile::write(&mut file, page.as_bytes())?;
             file.commit()?;
             json["gaussians"] = scene.len().into();
-            json["pictures"] = strip.len().into();
+            json["pictures"] = pictures.into();
             json["files"] = files_json(std::slice::from_ref(&args.output));
-            format!("{} Gaussians and {} pictures in {}", scene.len(), strip.len(), escape_path(&args.output))
+            format!("{} Gaussians and {pictures} pictures in {}", scene.len(), escape_path(&args.output))
         }
         Format::Nerfstudio | Format::Tum | Format::Kitti | Format::Colmap => {
             let format = match format {
