@@ -219,11 +219,12 @@ fn samples(ms: &[f64], what: &str, deadline: Option<f64>) -> String {
     let mut free = [f64::NEG_INFINITY; 2];
     let mut mark = |value: f64, label: String| {
         let x = at(value);
-        let row = usize::from(x < free[0]);
-        free[row] = x + 7.0 * label.len() as f64;
-        let y = 28 - 14 * row;
         // Labels near the right end stand on the left of their line.
-        let (at, anchor) = if x > 820.0 { (x - 4.0, "end") } else { (x + 4.0, "start") };
+        let wide = 7.0 * label.len() as f64;
+        let (at, anchor, start) = if x > 820.0 { (x - 4.0, "end", x - wide) } else { (x + 4.0, "start", x) };
+        let row = usize::from(start < free[0]);
+        free[row] = start + wide;
+        let y = 28 - 14 * row;
         let _ = write!(
             svg,
             "<line class=\"mark\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{}\" y2=\"160\"/>\
