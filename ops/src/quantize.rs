@@ -35,6 +35,19 @@ pub struct Before<'a> {
     pub rotation: Option<Rotation<'a>>,
 }
 
+impl Before<'_> {
+    /// Checks the widths against rows of `cols` values.
+    pub(crate) fn check(&self, cols: usize) {
+        if let Some(Norm { affine: Some((gain, offset)), .. }) = self.norm {
+            let (g, o) = (gain.len(), offset.len());
+            assert!(g == cols && o == cols, "{g} gains, {o} offsets, {cols} columns");
+        }
+        if let Some(rotation) = self.rotation {
+            assert_eq!(rotation.width(), cols, "width of a rotation");
+        }
+    }
+}
+
 /// One row to be quantized.
 pub(crate) struct QuantizeRow<'a> {
     pub x: &'a [f32],
@@ -337,13 +350,7 @@ pub fn quantize(ctx: Ctx, x: Mat, before: Before, out: RowsS8Mut) {
         out.data.len(),
         out.scales.len()
     );
-    if let Some(Norm { affine: Some((gain, offset)), .. }) = before.norm {
-        let (g, o) = (gain.len(), offset.len());
-        assert!(g == cols && o == cols, "{g} gains, {o} offsets, {cols} columns");
-    }
-    if let Some(rotation) = before.rotation {
-        assert_eq!(rotation.width(), cols, "width of a rotation");
-    }
+    before.check(cols);
     if cols == 0 {
         out.scales.fill(0.0);
         return;

@@ -15,7 +15,7 @@ use tile::{Finish, Tile};
 pub use pack::{NR, PanelData, Panels, pack_f16, pack_f32, panel_len, unpack};
 pub use s8::pack::{PanelsS8, RowsS8, RowsS8Mut, col_sums, pack_s8, padded_k, panel_len_s8, unpack_s8};
 pub use s8::table::{GEMM_S8, GemmS8Kernel};
-pub use s8::{gemm_s8, gemm_s8_sums, working_memory_s8};
+pub use s8::{gemm_s8, gemm_s8_quantize, gemm_s8_sums, working_memory_s8, working_memory_s8_quantize};
 pub use table::{GEMM_F, GemmKernel, WeightType};
 
 /// Activation of an epilogue.

@@ -1,8 +1,11 @@
-use crate::common::{CANARY, Random, Same, everywhere};
+use crate::common::{CANARY, Random, Same, everywhere, same_bits};
 use sf_ops::gemm::{
-    Act, Epilogue, GEMM_S8, PanelsS8, RowsS8, col_sums, gemm_s8, gemm_s8_sums, pack_s8, padded_k, panel_len_s8,
+    Act, Epilogue, GEMM_S8, PanelsS8, RowsS8, RowsS8Mut, col_sums, gemm_s8, gemm_s8_quantize, gemm_s8_sums, pack_s8,
+    padded_k, panel_len_s8,
 };
-use sf_ops::{Ctx, Kernels, MatMut, activation, reference};
+use sf_ops::hadamard::Rotation;
+use sf_ops::quantize::{Before, Norm, quantize};
+use sf_ops::{Ctx, Kernels, Mat, MatMut, activation, reference};
 
 /// Values of a case.
 #[derive(Clone, Copy, Debug)]
@@ -214,6 +217,31 @@ fn every_pair_of_values_multiplies_exactly() {
             assert_eq!(*y, i32::from(all[i / n]) * i32::from(all[i % n]), "{name}: pair {i}");
         }
     });
+}
+
+#[test]
+fn outputs_quantized_at_once_equal_the_two_steps() {
+    for (m, n, k) in [(1, 16, 24), (5, 48, 30), (17, 33, 8), (70, 192, 64), (40, 1040, 20), (131, 512, 16), (0, 16, 4)]
+    {
+        let case = Case::new(m, n, k, Fill::Random);
+        let signs: Vec<u16> = (0..n as u32 / 16).map(|i| (i * 40_503) as u16).collect();
+        let rotation = n.is_multiple_of(16).then(|| Rotation::new(n, &signs));
+        for (kind, norm) in [(2, None), (1, Some(Norm { affine: None, eps: 1e-6 }))] {
+            let before = Before { norm, rotation };
+            everywhere(|ctx, name| {
+                let mut y = vec![0.0; m * n];
+                gemm_s8(ctx, case.rows(), case.weights(), case.epilogue(kind), MatMut::new(&mut y, m, n));
+                let (mut bytes, mut scales) = (vec![0; m * padded_k(n)], vec![0.0; m]);
+                let rows = RowsS8Mut { m, k: n, data: &mut bytes, scales: &mut scales };
+                quantize(ctx, Mat::new(&y, m, n), before, rows);
+                let (mut b, mut s) = (vec![-128; m * padded_k(n)], vec![CANARY; m]);
+                let rows = RowsS8Mut { m, k: n, data: &mut b, scales: &mut s };
+                gemm_s8_quantize(ctx, case.rows(), case.weights(), case.epilogue(kind), before, rows);
+                assert!(b == bytes, "{m} x {n} x {k}, {name}");
+                same_bits(&s, &scales, name);
+            });
+        }
+    }
 }
 
 #[test]

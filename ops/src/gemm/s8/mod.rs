@@ -34,7 +34,8 @@ use crate::cpu::Ctx;
 use crate::mat::MatMut;
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
-use pack::{PanelsS8, QUAD, RowsS8, STEP, padded_k};
+use crate::quantize::{Before, QuantizeRow};
+use pack::{PanelsS8, QUAD, RowsS8, RowsS8Mut, STEP, padded_k};
 use table::{Activations, GemmS8Kernel};
 use tile::{ColumnsS8, FinishS8, MAX_NV, Plus, QuadPack, TileS8, WidePack};
 
@@ -65,8 +66,8 @@ pub fn working_memory_s8(k: usize) -> usize {
 enum Sink<'a> {
     /// As they are, `[m, n]`.
     Sums(SharedMut<'a, i32>),
-    /// Through the epilogue into rows `stride` apart.
-    Values { ep: Epilogue<'a>, out: SharedMut<'a, f32>, stride: usize },
+    /// Through the epilogue into rows `stride` apart, of which row `first` is the first.
+    Values { ep: Epilogue<'a>, out: SharedMut<'a, f32>, stride: usize, first: usize },
 }
 
 struct Product<'a> {
@@ -207,8 +208,8 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
             let rows = mr.min(part.rows - r);
             let width = p.kernel.fit(rows);
             let acc = &mut acc[tile * size..][..size];
-            if last && let Sink::Values { out, stride, .. } = &p.sink {
-                out.prefetch((part.first + r) * stride + part.panel * NR, part.panels * NR, *stride, rows);
+            if last && let Sink::Values { out, stride, first, .. } = &p.sink {
+                out.prefetch((part.first + r - first) * stride + part.panel * NR, part.panels * NR, *stride, rows);
             }
             let one = TileS8 {
                 rows: width,
@@ -250,7 +251,7 @@ fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &
                 }
             }
         }
-        Sink::Values { ep, out, stride } => {
+        Sink::Values { ep, out, stride, first } => {
             ctx.kernels.finish_s8(FinishS8 {
                 acc,
                 acc_stride,
@@ -262,7 +263,7 @@ fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &
                 plus: if ep.residual { Plus::Output } else { Plus::Nothing },
                 relu_sum: false,
                 out,
-                at: part.first * stride + col,
+                at: (part.first - first) * stride + col,
                 stride: *stride,
                 cols,
             });
@@ -287,8 +288,86 @@ pub fn gemm_s8(ctx: Ctx, a: RowsS8, w: PanelsS8, ep: Epilogue, out: MatMut) {
     let stride = out.stride;
     let (macs, bytes) = (a.m * w.n * w.k, (a.m + w.n) * w.k + 4 * a.m * w.n);
     let _span = opclock::span(Op::GemmS8, || Work { macs: macs as u64, bytes: bytes as u64 });
-    let sink = Sink::Values { ep, out: SharedMut::new(out.data), stride };
+    let sink = Sink::Values { ep, out: SharedMut::new(out.data), stride, first: 0 };
     product(ctx, &Product::new(ctx, a, w, sink));
+}
+
+/// f32 values of a block of rows that wait to be quantized: 256 KiB.
+const WAITING: usize = 1 << 16;
+
+/// Most f32-sized values of working memory that each thread of the pool keeps after [`gemm_s8_quantize`] of up to `k` inputs and
+/// `n` outputs, whatever the kernel; for memory plans.
+pub fn working_memory_s8_quantize(k: usize, n: usize) -> usize {
+    working_memory_s8(k) + WAITING.max(MAX_MR * n) + n
+}
+
+/// [`gemm_s8`] and [`crate::quantize::quantize`] in one: the f32 outputs of a block of rows stay in the cache until they are quantized and
+/// are never written to memory. `a` `[m, k]` times the transpose of `w` `[n, k]` through `ep` (without residual), then `before` and
+/// quantization per row -> `out` `[m, n]`; the same bits as the two steps.
+///
+/// Blocks have some 65,536 outputs, so weights are read once per 65,536 / n rows: right up to n about 2048, while weights stay in the
+/// caches; beyond that the two steps are faster.
+pub fn gemm_s8_quantize(ctx: Ctx, a: RowsS8, w: PanelsS8, ep: Epilogue, before: Before, out: RowsS8Mut) {
+    let (a, w) = checked(a, w);
+    let (m, n) = (a.m, w.n);
+    assert!(!ep.residual, "no residual where outputs are quantized");
+    for (what, v) in [("bias", ep.bias), ("gamma", ep.gamma)] {
+        assert!(v.is_none_or(|v| v.len() == n), "{what} of {n} outputs");
+    }
+    before.check(n);
+    assert_eq!((out.m, out.k), (m, n), "size of quantized rows");
+    let out_width = padded_k(n);
+    assert!(out.data.len() == m * out_width && out.scales.len() == m, "bytes and scales of {m} rows of {out_width}");
+    if m == 0 || n == 0 {
+        out.scales.fill(0.0);
+        return;
+    }
+    let _span = opclock::span(Op::GemmS8, || Work {
+        macs: (m * w.n * w.k) as u64,
+        bytes: (a.data.len() + w.data.len() + m * out_width) as u64,
+    });
+    let few = m <= FEW;
+    let kernel = ctx.kernels.products_s8(few);
+    let (mr, nv) = (kernel.mr, kernel.nr / NR);
+    let words = padded_k(w.k) / QUAD * kernel.bytes;
+    let tiles = (PACKED / (mr * words.max(1))).min(WAITING / (mr * n)).clamp(1, TILES);
+    let row_tiles = m.div_ceil(mr);
+    let tasks = row_tiles.div_ceil(tiles);
+    let block = row_tiles.div_ceil(tasks) * mr;
+    let scratch = LINE + block * (words + nv * NR) + block * n + n;
+    let most = working_memory_s8_quantize(w.k, n);
+    assert!(scratch <= most, "{scratch} values of working memory, {most} announced");
+    ctx.pool.reserve_scratch(scratch);
+    let (bytes, scales) = (SharedMut::new(out.data), SharedMut::new(out.scales));
+    ctx.pool.run(tasks, &|task, worker| {
+        let tiles = piece(row_tiles, tasks, task);
+        let first = tiles.start * mr;
+        let rows = (tiles.end * mr).min(m) - first;
+        ctx.pool.with_scratch(worker, scratch, |memory| {
+            let skip = memory.as_ptr().align_offset(LINE * size_of::<f32>()).min(LINE);
+            let (acc, memory) = memory[skip..].split_at_mut(block * nv * NR);
+            let (packed, memory) = memory.split_at_mut(block * words);
+            let (values, work) = memory.split_at_mut(block * n);
+            let acc: &mut [i32] = bytemuck::cast_slice_mut(acc);
+            {
+                let sink = Sink::Values { ep, out: SharedMut::new(values), stride: n, first };
+                let p = Product { few, kernel, a, w, sink };
+                pack_block(ctx, &p, first..first + rows, packed);
+                for panel in (0..n.div_ceil(NR)).step_by(nv) {
+                    let panels = nv.min(n.div_ceil(NR) - panel);
+                    block_of_panels(ctx, &p, Part { first, rows, panel, panels }, (packed, acc));
+                }
+            }
+            for (r, x) in values[..rows * n].chunks_exact(n).enumerate() {
+                let row = first + r;
+                // SAFETY: rows are disjoint and each belongs to one task.
+                #[allow(unsafe_code)]
+                let (out, scale) =
+                    unsafe { (bytes.slice(row * out_width..(row + 1) * out_width), scales.slice(row..row + 1)) };
+                scale[0] = ctx.kernels.quantize(QuantizeRow { x, before, work: &mut work[..n], out });
+            }
+        });
+    });
 }
 
 /// The exact sums of [`gemm_s8`], `[m, n]`: what every kernel must agree on.
