@@ -116,7 +116,14 @@ struct Chunk {
     len: usize,
     lists: [[u8; CHUNK]; BLOCKS],
     lens: [u16; BLOCKS],
+    /// Of the block that is being drawn, one per entry of its list.
+    weights: [Line; CHUNK],
 }
+
+/// A vector on a cache line.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+pub(crate) struct Line(pub(crate) [f32; LANES]);
 
 impl Default for Tile {
     fn default() -> Self {
@@ -131,6 +138,7 @@ impl Default for Tile {
                 len: 0,
                 lists: [[0; CHUNK]; BLOCKS],
                 lens: [0; BLOCKS],
+                weights: [Line([0.0; LANES]); CHUNK],
             }),
             updates: 0,
         }
@@ -379,13 +387,14 @@ impl Tile {
         while left != 0 {
             let b = left.trailing_zeros() as usize % BLOCKS;
             left &= left - 1;
-            let list = &self.chunk.lists[b][..usize::from(self.chunk.lens[b]).min(CHUNK)];
+            let Chunk { shown, lists, lens, weights, .. } = &mut *self.chunk;
+            let list = &lists[b][..usize::from(lens[b]).min(CHUNK)];
             if list.is_empty() {
                 continue;
             }
             let extra = &mut self.extra[b * shared.extra.channels..][..shared.extra.channels];
             let (taken, alive) =
-                take(s, &mut self.blocks[b], columns_rows(s, b), list, &self.chunk.shown, shared, extra);
+                take(s, &mut self.blocks[b], columns_rows(s, b), list, (shown, weights), shared, extra);
             self.updates += taken as u64;
             self.alive &= !(u64::from(!alive) << b);
         }
@@ -456,43 +465,54 @@ impl Shown {
 }
 
 /// One block takes its list; how many entries it took and whether a pixel is still unfinished.
+///
+/// First the weights with T alone in registers, then the sums: together they are ten registers of AVX2's sixteen, and
+/// what did not fit was T, on its way through memory from one Gaussian to the next.
 #[inline(always)]
 fn take<S: Simd>(
     s: S,
     block: &mut Block,
     at: (S::V, S::V),
     list: &[u8],
-    shown: &[Shown; CHUNK],
+    chunk: (&[Shown; CHUNK], &mut [Line; CHUNK]),
     shared: &Shared,
     extra: &mut [[f32; LANES]],
 ) -> (usize, bool) {
+    let (shown, weights) = chunk;
     let mut t = s.load(&block.t);
-    let (mut r, mut g) = (s.load(&block.sum[0]), s.load(&block.sum[1]));
-    let (mut b, mut z) = (s.load(&block.sum[2]), s.load(&block.sum[3]));
     let (mut taken, mut alive) = (list.len(), true);
-    for (n, &i) in list.iter().enumerate() {
-        let o = &shown[usize::from(i)];
-        let Step { weight, t: next, going, .. } = o.step(s, at, t, shared.a_max);
-        t = next;
-        r = weight.mul_add(s.splat(o.value[0]), r);
-        g = weight.mul_add(s.splat(o.value[1]), g);
-        b = weight.mul_add(s.splat(o.value[2]), b);
-        z = weight.mul_add(s.splat(o.value[3]), z);
-        if !extra.is_empty() {
-            let values = &shared.extra.values[o.index as usize * extra.len()..][..extra.len()];
-            for (sum, value) in extra.iter_mut().zip(values) {
-                weight.mul_add(s.splat(*value), s.load(sum)).store(sum);
-            }
-        }
-        if going == 0 {
+    for (n, (&i, weight)) in list.iter().zip(weights.iter_mut()).enumerate() {
+        let step = shown[usize::from(i)].step(s, at, t, shared.a_max);
+        t = step.t;
+        step.weight.store(&mut weight.0);
+        if step.going == 0 {
             (taken, alive) = (n + 1, false);
             break;
         }
     }
     t.store(&mut block.t);
+    let (list, weights) = (&list[..taken], &weights[..taken]);
+    let (mut r, mut g) = (s.load(&block.sum[0]), s.load(&block.sum[1]));
+    let (mut b, mut z) = (s.load(&block.sum[2]), s.load(&block.sum[3]));
+    for (&i, weight) in list.iter().zip(weights) {
+        let (o, weight) = (&shown[usize::from(i)], s.load(&weight.0));
+        r = weight.mul_add(s.splat(o.value[0]), r);
+        g = weight.mul_add(s.splat(o.value[1]), g);
+        b = weight.mul_add(s.splat(o.value[2]), b);
+        z = weight.mul_add(s.splat(o.value[3]), z);
+    }
     r.store(&mut block.sum[0]);
     g.store(&mut block.sum[1]);
     b.store(&mut block.sum[2]);
     z.store(&mut block.sum[3]);
+    for (channel, sum) in extra.iter_mut().enumerate() {
+        let mut total = s.load(sum);
+        for (&i, weight) in list.iter().zip(weights) {
+            let index = shown[usize::from(i)].index as usize;
+            let value = shared.extra.values[index * shared.extra.channels + channel];
+            total = s.load(&weight.0).mul_add(s.splat(value), total);
+        }
+        total.store(sum);
+    }
     (taken, alive)
 }

@@ -21,7 +21,7 @@ use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::GROUPS;
-use crate::blend::{BLOCKS, CHUNK, Draw, PER_ROW, Place, Shared, Shown, Tile, columns_rows};
+use crate::blend::{BLOCKS, CHUNK, Draw, Line, PER_ROW, Place, Shared, Shown, Tile, columns_rows};
 use crate::project::{BLOCK, Record, TILE};
 
 /// Sums of one Gaussian over pixels: h, h d, h d d, h e, h d e, h e e, then w dL/dred, w dL/dgreen, w dL/dblue, w dL/dD.
@@ -51,11 +51,6 @@ struct Pair {
     /// T alpha.
     weight: [f32; LANES],
 }
-
-/// A vector on a cache line.
-#[derive(Clone, Copy, Debug)]
-#[repr(align(64))]
-struct Line([f32; LANES]);
 
 /// Pairs of one block, neighbours in order.
 #[derive(Clone, Copy, Debug)]
