@@ -110,6 +110,28 @@ fn a_stack_of_equal_depths_is_drawn_in_index_order() {
 }
 
 #[test]
+fn two_hundred_tiny_scenes_match_the_oracle() {
+    let (mut pixels, mut over) = (0, 0);
+    for seed in 0..200 {
+        let rng = &mut Rng(10_000 + seed);
+        let (width, height) = (1 + rng.below(24) as u32, 1 + rng.below(24) as u32);
+        let camera = camera(rng, width, height);
+        let count = rng.below(40);
+        let mut scene = hard_scene(rng, &camera, count);
+        // Colours are not clamped.
+        scene.colour.iter_mut().flatten().for_each(|c| *c = 3.0 * *c - 1.0);
+        let settings = SplatSettings {
+            aa: seed % 2 == 1,
+            eps2d: if seed % 8 == 7 { 0.1 } else { 0.3 },
+            ..SplatSettings::default()
+        };
+        let (n, bad) = compare(&format!("tiny {seed}"), &scene, &camera, &settings);
+        (pixels, over) = (pixels + n, over + bad);
+    }
+    assert!(over * 1000 <= pixels, "{over} of {pixels} pixels are off by more than 1/255");
+}
+
+#[test]
 fn boxes_leave_nothing_out() {
     for seed in 0..8 {
         let rng = &mut Rng(40 + seed);
