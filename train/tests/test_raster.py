@@ -1,6 +1,7 @@
 """The rasterizer's images and gradients against a dense renderer in plain PyTorch, and an optimisation through it."""
 
 import math
+import os
 
 import pytest
 import torch
@@ -178,6 +179,20 @@ def test_any_number_of_threads_gives_the_same_bits():
         torch.set_num_threads(before)
         raster._rasters = None
     assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+def test_a_forked_process_draws_too():
+    """Data loaders fork: the child has none of the parent's threads and must not wait for them."""
+    inputs = [t.float() for t in scene(5, 50)]
+    want, _, _ = rasterize(*inputs, *K, WIDTH, HEIGHT)
+    child = os.fork()
+    if child == 0:
+        same = False
+        try:
+            same = torch.equal(rasterize(*inputs, *K, WIDTH, HEIGHT)[0], want)
+        finally:
+            os._exit(0 if same else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 def test_wrong_calls_are_refused():
