@@ -108,10 +108,10 @@ impl Renderer {
         let mut next = 0u32;
         for (group, first) in groups.iter().zip(first_slot.iter_mut()) {
             first.clear();
-            for record in &group.records {
+            for spot in &group.spots {
                 first.push(next);
                 // The sum over all is limited when the image is drawn.
-                next += record.tiles() as u32;
+                next += spot.tiles() as u32;
             }
         }
         slots.clear();
@@ -138,10 +138,8 @@ impl Renderer {
             let mut history = lock(&histories[worker]);
             let place = place(t, columns, (width, height));
             tile.clear(place, 0);
-            for group in &groups {
-                tile.push(group.tile(t));
-            }
-            self.kernels.enter(BlendBack { tile: &mut tile, history: &mut history, place, shared: &back });
+            let lists = std::array::from_fn(|g| groups[g].tile(t));
+            self.kernels.enter(BlendBack { tile: &mut tile, lists, history: &mut history, place, shared: &back });
         });
     }
 
@@ -166,7 +164,7 @@ impl Renderer {
             let start = bin::run(scene.len(), g).start;
             for (record, &first) in group.records.iter().zip(&self.back.first_slot[g]) {
                 let mut sums = [0.0f64; SUMS];
-                for slot in &self.back.slots[first as usize..][..record.tiles() as usize] {
+                for slot in &self.back.slots[first as usize..][..record.spot().tiles() as usize] {
                     for (sum, value) in sums.iter_mut().zip(slot) {
                         *sum += f64::from(f32::from_bits(value.load(Relaxed)));
                     }

@@ -12,7 +12,7 @@
 use sf_formats::scene::Gaussians;
 use sf_ops::Kernels;
 
-use crate::project::{Counts, Project, Projector, Record, Rect, TILE};
+use crate::project::{Counts, Project, Projector, Record, Rect, Spot, TILE};
 
 /// Number of runs the scene is cut into. Fixed, not the number of threads.
 pub const GROUPS: usize = 16;
@@ -87,6 +87,8 @@ pub fn run(gaussians: usize, group: usize) -> std::ops::Range<usize> {
 pub struct Group {
     /// The visible Gaussians of the run, in index order.
     pub records: Vec<Record>,
+    /// Where they lie.
+    pub spots: Vec<Spot>,
     /// What was dropped or clamped.
     pub counts: Counts,
     /// Entries this group makes: the sum over its records of the tiles they meet.
@@ -108,32 +110,34 @@ impl Group {
         usable: Option<&(dyn Fn(usize) -> bool + Sync)>,
     ) {
         self.records.clear();
+        self.spots.clear();
         self.counts = Counts::default();
-        let (records, counts) = (&mut self.records, &mut self.counts);
-        kernels.enter(Project { projector, scene, run, usable, records, counts });
-        self.entries = self.records.iter().map(Record::tiles).sum();
+        let (records, spots, counts) = (&mut self.records, &mut self.spots, &mut self.counts);
+        self.entries = kernels.enter(Project { projector, scene, run, usable, records, spots, counts });
     }
 
     /// Scatters the keys of the records to the tiles of an image of `tiles` (columns, rows).
     ///
     /// Panics if there are 2^32 entries or more; the caller has a lower limit.
     pub fn bin(&mut self, group: usize, form: KeyForm, tiles: (u32, u32)) {
-        let count = tiles.0 as usize * tiles.1 as usize;
-        let entries = u32::try_from(self.entries).expect("fewer than 2^32 entries");
+        let (columns, count) = (tiles.0, tiles.0 as usize * tiles.1 as usize);
+        let entries = u32::try_from(self.entries).expect("fewer than 2^32 entries") as usize;
         self.starts.clear();
         self.starts.resize(count + 1, 0);
-        self.keys.clear();
-        self.keys.resize(entries as usize, 0);
-        for r in &self.records {
-            each_tile(r, tiles.0, |t, _| self.starts[t + 1] += 1);
+        for spot in &self.spots {
+            each_tile(spot, columns, |t, _| self.starts[t + 1] += 1);
+        }
+        // Every key is written below: what is left of another image needs no clearing.
+        if self.keys.len() < entries {
+            self.keys.resize(entries, 0);
         }
         for t in 0..count {
             self.starts[t + 1] += self.starts[t];
         }
         // Filling moves every start to its end, which is the next one's start; shifted back below.
-        for (i, r) in self.records.iter().enumerate() {
-            each_tile(r, tiles.0, |t, place| {
-                self.keys[self.starts[t] as usize] = form.pack(r.z, group, i, r.rect(place));
+        for (i, spot) in self.spots.iter().enumerate() {
+            each_tile(spot, columns, |t, place| {
+                self.keys[self.starts[t] as usize] = form.pack(spot.z, group, i, spot.rect(place));
                 self.starts[t] += 1;
             });
         }
@@ -149,10 +153,10 @@ impl Group {
     }
 }
 
-/// Calls `f` with the number and the first pixel of every tile that a record meets.
+/// Calls `f` with the number and the first pixel of every tile that a record at `spot` meets.
 #[inline(always)]
-fn each_tile(r: &Record, columns: u32, mut f: impl FnMut(usize, (usize, usize))) {
-    let (x, y) = r.tile_box();
+fn each_tile(spot: &Spot, columns: u32, mut f: impl FnMut(usize, (usize, usize))) {
+    let (x, y) = spot.tile_box();
     for ty in y.0..y.1 {
         for tx in x.0..x.1 {
             f((ty * columns + tx) as usize, ((tx * TILE) as usize, (ty * TILE) as usize));

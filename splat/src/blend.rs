@@ -101,8 +101,8 @@ pub struct Tile {
     pub(crate) alive: u64,
     /// `[block, channel][lane]`.
     extra: Vec<[f32; LANES]>,
-    /// The list as it came, then the list by depth bucket.
-    keys: [Vec<u64>; 2],
+    /// The keys by depth bucket; the first ones of the vector.
+    keys: Vec<u64>,
     /// `starts[b]` of bucket b, one more for the end.
     starts: Box<[u32; BUCKETS + 1]>,
     chunk: Box<Chunk>,
@@ -131,7 +131,7 @@ impl Default for Tile {
             blocks: Box::new([Block { t: [1.0; LANES], sum: [[0.0; LANES]; 4] }; BLOCKS]),
             alive: 0,
             extra: Vec::new(),
-            keys: [Vec::new(), Vec::new()],
+            keys: Vec::new(),
             starts: Box::new([0; BUCKETS + 1]),
             chunk: Box::new(Chunk {
                 shown: [Shown::default(); CHUNK],
@@ -169,8 +169,10 @@ impl Shared<'_> {
 /// Composites the list of a tile in key order.
 #[derive(Debug)]
 pub struct Blend<'a> {
-    /// The tile, cleared and with its list.
+    /// The tile, cleared.
     pub tile: &'a mut Tile,
+    /// Its keys, in any order.
+    pub lists: [&'a [u64]; bin::GROUPS],
     /// Where it lies.
     pub place: Place,
     /// The image.
@@ -182,8 +184,8 @@ impl Body for Blend<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let Blend { tile, place, shared } = self;
-        tile.each_chunk(s, place, shared, &mut Composite);
+        let Blend { tile, lists, place, shared } = self;
+        tile.each_chunk(s, (place, &lists), shared, &mut Composite);
     }
 }
 
@@ -212,27 +214,33 @@ fn sort(keys: &mut [u64]) {
 }
 
 impl Tile {
-    /// Orders the list front to back as far as it is seen, and hands it on in chunks.
+    /// Orders the keys front to back as far as they are seen, and hands them on in chunks.
     #[inline(always)]
-    pub(crate) fn each_chunk<S: Simd, D: Draw>(&mut self, s: S, place: Place, shared: &Shared, draw: &mut D) {
+    pub(crate) fn each_chunk<S: Simd, D: Draw>(
+        &mut self,
+        s: S,
+        (place, lists): (Place, &[&[u64]; bin::GROUPS]),
+        shared: &Shared,
+        draw: &mut D,
+    ) {
         let tile = self;
         let (form, first) = (shared.form, (place.x, place.y));
-        let buckets = tile.split(form);
+        let buckets = tile.split(lists, form);
         // Kept keys move to the front of the list, in order; `dealt..kept` wait for their records.
         let (mut dealt, mut kept) = (0, 0);
         for b in 0..buckets {
             let (start, end) = (tile.starts[b] as usize, tile.starts[b + 1] as usize);
             let sorted = kept;
             for i in start..end {
-                let key = tile.keys[1][i];
+                let key = tile.keys[i];
                 let mask = form.blocks(key, || shared.record(key).blocks(first));
-                tile.keys[1][kept] = key;
+                tile.keys[kept] = key;
                 kept += usize::from(mask & tile.alive != 0);
             }
-            sort(&mut tile.keys[1][sorted..kept]);
+            sort(&mut tile.keys[sorted..kept]);
             // Records lie in index order and are wanted in depth order: nearly every one is a cache miss, so all
             // of a chunk are on their way before the first is read.
-            for &key in &tile.keys[1][sorted..kept] {
+            for &key in &tile.keys[sorted..kept] {
                 prefetch(shared.record(key));
             }
             while kept - dealt >= CHUNK {
@@ -250,7 +258,7 @@ impl Tile {
         tile.empty_chunk();
     }
 
-    /// Starts a tile: T = 1 inside the image, finished outside, and an empty list.
+    /// Starts a tile: T = 1 inside the image, finished outside.
     pub fn clear(&mut self, place: Place, channels: usize) {
         self.alive = 0;
         for (i, block) in self.blocks.iter_mut().enumerate() {
@@ -264,24 +272,17 @@ impl Tile {
         }
         self.extra.clear();
         self.extra.resize(BLOCKS * channels, [0.0; LANES]);
-        self.keys[0].clear();
         self.empty_chunk();
         self.updates = 0;
     }
 
     /// Makes room for lists of up to `entries` keys and for extra sums, so that no tile of an image allocates.
     pub fn reserve(&mut self, entries: usize, channels: usize) {
-        for keys in &mut self.keys {
-            keys.clear();
-            keys.reserve(entries);
+        if self.keys.len() < entries {
+            self.keys.resize(entries, 0);
         }
         self.extra.clear();
         self.extra.reserve(BLOCKS * channels);
-    }
-
-    /// Adds keys to the list.
-    pub fn push(&mut self, keys: &[u64]) {
-        self.keys[0].extend_from_slice(keys);
     }
 
     /// Blocks that took a Gaussian since [`Tile::clear`], counted once per pair.
@@ -289,35 +290,43 @@ impl Tile {
         self.updates
     }
 
-    /// Orders the list by bucket of depth, not inside a bucket, and returns the number of buckets.
-    fn split(&mut self, form: KeyForm) -> usize {
-        let [list, split] = &mut self.keys;
-        split.clear();
-        split.resize(list.len(), 0);
-        let (mut least, mut most) = (u64::MAX, 0);
-        for &key in &*list {
-            least = least.min(key);
-            most = most.max(key);
+    /// Orders keys by bucket of depth, not inside a bucket, and returns the number of buckets.
+    fn split(&mut self, lists: &[&[u64]; bin::GROUPS], form: KeyForm) -> usize {
+        let (mut least, mut most, mut len) = (u64::MAX, 0, 0);
+        for list in lists {
+            len += list.len();
+            for &key in *list {
+                least = least.min(key);
+                most = most.max(key);
+            }
         }
+        if self.keys.len() < len {
+            self.keys.resize(len, 0);
+        }
+        let split = &mut self.keys[..len];
         let Some(range) = form.depth(most).checked_sub(form.depth(least)) else { return 0 };
         let least = form.depth(least);
         // The shift that leaves the range just under the number of buckets: about 8 entries in each.
-        let wanted = (list.len() / 8).next_power_of_two().clamp(1, BUCKETS);
+        let wanted = (len / 8).next_power_of_two().clamp(1, BUCKETS);
         let shift = (u64::BITS - range.leading_zeros()).saturating_sub(wanted.trailing_zeros());
         let bucket = |key: u64| ((form.depth(key) - least) >> shift) as usize & (BUCKETS - 1);
         let buckets = (range >> shift) as usize + 1;
         self.starts[..=buckets].fill(0);
-        for &key in &*list {
-            self.starts[bucket(key) + 1] += 1;
+        for list in lists {
+            for &key in *list {
+                self.starts[bucket(key) + 1] += 1;
+            }
         }
         for b in 0..buckets {
             self.starts[b + 1] += self.starts[b];
         }
         // Filling moves every start to its end, which is the next one's start; shifted back below.
-        for &key in &*list {
-            let at = &mut self.starts[bucket(key)];
-            split[*at as usize] = key;
-            *at += 1;
+        for list in lists {
+            for &key in *list {
+                let at = &mut self.starts[bucket(key)];
+                split[*at as usize] = key;
+                *at += 1;
+            }
         }
         for b in (0..buckets).rev() {
             self.starts[b + 1] = self.starts[b];
@@ -331,8 +340,8 @@ impl Tile {
     fn deal_keys(&mut self, place: Place, shared: &Shared, keys: Range<usize>) {
         for i in keys.clone() {
             // Again, for those that the first hint lost.
-            prefetch(shared.record(self.keys[1][(i + AHEAD).min(keys.end - 1)]));
-            let key = self.keys[1][i];
+            prefetch(shared.record(self.keys[(i + AHEAD).min(keys.end - 1)]));
+            let key = self.keys[i];
             let record = shared.record(key);
             self.deal(record, place, shared.form.blocks(key, || record.blocks((place.x, place.y))));
         }
@@ -371,7 +380,7 @@ impl Tile {
 
     /// The Gaussians of the chunk and the keys of a part of the ordered list.
     pub(crate) fn chunk_and_keys(&self, keys: Range<usize>) -> (&[Shown], &[u64]) {
-        (&self.chunk.shown[..self.chunk.len], &self.keys[1][keys])
+        (&self.chunk.shown[..self.chunk.len], &self.keys[keys])
     }
 
     /// T of a block, negated where finished; the Gaussians of the chunk; which of them the block takes.

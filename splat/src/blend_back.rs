@@ -100,8 +100,10 @@ pub(crate) struct SharedBack<'a> {
 
 /// One tile.
 pub(crate) struct BlendBack<'a> {
-    /// The tile, cleared and with its list.
+    /// The tile, cleared.
     pub(crate) tile: &'a mut Tile,
+    /// Its keys.
+    pub(crate) lists: [&'a [u64]; GROUPS],
     pub(crate) history: &'a mut History,
     pub(crate) place: Place,
     pub(crate) shared: &'a SharedBack<'a>,
@@ -112,9 +114,14 @@ impl Body for BlendBack<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let BlendBack { tile, history, place, shared } = self;
+        let BlendBack { tile, lists, history, place, shared } = self;
         history.clear();
-        tile.each_chunk(s, place, shared.shared, &mut Write { history, place, first_slot: &shared.first_slot });
+        tile.each_chunk(
+            s,
+            (place, &lists),
+            shared.shared,
+            &mut Write { history, place, first_slot: &shared.first_slot },
+        );
         history.sums.clear();
         history.sums.resize(history.shown.len(), Line([0.0; LANES]));
         for b in 0..BLOCKS {
@@ -206,7 +213,7 @@ fn take<S: Simd>(
 
 /// Number of the tile in a record's box, row by row; the record meets it.
 fn tile_of(record: &Record, place: Place) -> u32 {
-    let (x, y) = record.tile_box();
+    let (x, y) = record.spot().tile_box();
     (place.y as u32 / TILE - y.0) * (x.1 - x.0) + (place.x as u32 / TILE - x.0)
 }
 

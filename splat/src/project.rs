@@ -113,7 +113,32 @@ impl Rect {
     }
 }
 
+/// What binning needs of a record, packed: the records themselves are read only where they are drawn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spot {
+    /// Camera z.
+    pub z: f32,
+    /// Columns `x.0..x.1`.
+    pub x: (u16, u16),
+    /// Rows `y.0..y.1`.
+    pub y: (u16, u16),
+}
+
 impl Record {
+    /// Where it lies.
+    #[inline(always)]
+    pub fn spot(&self) -> Spot {
+        Spot { z: self.z, x: self.x, y: self.y }
+    }
+
+    /// The blocks of the tile with first pixel `tile` that the pixel box meets; it must meet the tile.
+    #[inline(always)]
+    pub fn blocks(&self, tile: (usize, usize)) -> u64 {
+        self.spot().rect(tile).blocks()
+    }
+}
+
+impl Spot {
     /// The blocks of the tile with first pixel `(x, y)` that the pixel box meets; it must meet the tile.
     #[inline(always)]
     pub fn rect(&self, (x, y): (usize, usize)) -> Rect {
@@ -125,20 +150,15 @@ impl Record {
         Rect { x: span(self.x, x), y: span(self.y, y) }
     }
 
-    /// [`Rect::blocks`] of [`Record::rect`].
-    #[inline(always)]
-    pub fn blocks(&self, tile: (usize, usize)) -> u64 {
-        self.rect(tile).blocks()
-    }
-
     /// Number of tiles that the pixel box meets.
+    #[inline(always)]
     pub fn tiles(&self) -> u64 {
         let (x, y) = self.tile_box();
         u64::from(x.1 - x.0) * u64::from(y.1 - y.0)
     }
 
     /// Tile columns and rows of the pixel box, half open.
-    #[inline]
+    #[inline(always)]
     pub fn tile_box(&self) -> ((u32, u32), (u32, u32)) {
         let span = |p: (u16, u16)| (u32::from(p.0) / TILE, (u32::from(p.1) - 1) / TILE + 1);
         (span(self.x), span(self.y))
@@ -340,16 +360,20 @@ pub struct Project<'a> {
     pub usable: Option<&'a (dyn Fn(usize) -> bool + Sync)>,
     /// Where visible ones go, in index order.
     pub records: &'a mut Vec<Record>,
+    /// Where their places go.
+    pub spots: &'a mut Vec<Spot>,
     /// What was dropped or clamped.
     pub counts: &'a mut Counts,
 }
 
 impl Body for Project<'_> {
-    type Output = ();
+    /// Entries: the sum over the records of the tiles they meet.
+    type Output = u64;
 
     #[inline(always)]
-    fn run<S: Simd>(self, s: S) {
-        let Project { projector, scene, run, usable, records, counts } = self;
+    fn run<S: Simd>(self, s: S) -> u64 {
+        let Project { projector, scene, run, usable, records, spots, counts } = self;
+        let mut entries = 0;
         for start in run.clone().step_by(LANES) {
             let lanes = (run.end - start).min(LANES);
             let mut rows = [[0.0; LANES]; LANES];
@@ -382,8 +406,12 @@ impl Body for Project<'_> {
                     continue;
                 }
                 records.push(record);
+                let spot = record.spot();
+                spots.push(spot);
+                entries += spot.tiles();
             }
         }
+        entries
     }
 }
 

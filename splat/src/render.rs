@@ -113,11 +113,16 @@ impl Rendered {
         for (image, planes) in
             [(&mut self.rgb, 3), (&mut self.depth, 1), (&mut self.alpha, 1), (&mut self.extra, channels)]
         {
-            let len = pixels.checked_mul(planes);
-            image.clear();
-            len.and_then(|len| image.try_reserve_exact(len).ok().map(|()| image.resize(len, 0.0))).ok_or_else(
-                || Error::resource("render", format!("no memory for a {width}x{height} image of {planes} channels")),
-            )?;
+            // Tiles write every pixel, so what another image left needs no clearing.
+            let room = pixels.checked_mul(planes).filter(|&len| {
+                let more = len.saturating_sub(image.len());
+                more == 0 || image.try_reserve_exact(more).is_ok()
+            });
+            let Some(len) = room else {
+                let why = format!("no memory for a {width}x{height} image of {planes} channels");
+                return Err(Error::resource("render", why));
+            };
+            image.resize(len, 0.0);
         }
         (self.width, self.height, self.channels) = (width, height, channels);
         Ok(())
@@ -216,8 +221,8 @@ impl Renderer {
         }
         let columns = camera.width.div_ceil(TILE);
         let rows = camera.height.div_ceil(TILE);
-        let stats = self.project(scene, &Projector::new(camera, settings), extra);
         let limit = options.max_entries.min(u64::from(u32::MAX));
+        let stats = self.project(scene, &Projector::new(camera, settings), extra);
         if stats.entries > limit {
             return Err(Error::resource(
                 "render",
@@ -307,10 +312,8 @@ impl Renderer {
             let mut tile = lock(&self.tiles[worker]);
             let place = place(t, columns, (width, height));
             tile.clear(place, channels);
-            for group in groups {
-                tile.push(group.tile(t));
-            }
-            self.kernels.enter(Blend { tile: &mut tile, place, shared });
+            let lists = std::array::from_fn(|g| groups[g].tile(t));
+            self.kernels.enter(Blend { tile: &mut tile, lists, place, shared });
             updates.fetch_add(tile.updates(), Relaxed);
             lock(&bands[t / columns]).store(&tile, place, (width, channels), background);
         });
