@@ -3,14 +3,12 @@
 //! Rows of a head are worked on at a width of d rounded up to 16, zeros behind d, so that everything runs in whole
 //! vectors. The norm and the turn have the bits of [`crate::rope::qk_norm_rope`].
 
-use crate::gemm::pack::MAX_MR;
 use crate::gemm::s8::pack::QUAD;
 use crate::gemm::s8::table::{Activations, GemmS8Kernel};
-use crate::gemm::s8::tile::{QuadPack, pack_quads};
 use crate::hadamard::{Rotation, rotate};
 use crate::quantize::clamp;
 use crate::rope::{RopeTable, turn};
-use crate::simd::{LANES, Simd, Vector, fold_add};
+use crate::simd::{LANES, Simd, Vector};
 
 /// Widest head.
 pub(crate) const MAX_D: usize = 256;
@@ -22,6 +20,29 @@ pub(crate) const ROUND: f32 = 12_582_912.0;
 /// Width of a head's rows in working memory.
 pub(crate) fn padded_d(d: usize) -> usize {
     d.next_multiple_of(LANES)
+}
+
+/// Bytes of a quantized row in working memory: blocks of 16 quads.
+pub(crate) fn padded_bytes(d: usize) -> usize {
+    padded_d(d).next_multiple_of(LANES * QUAD)
+}
+
+/// Rows of a stage, with room for a vector that runs over.
+pub(crate) const STAGE_ROWS: usize = KEYS + LANES;
+
+/// Most vectors of a head.
+const MAX_N: usize = MAX_D / LANES;
+
+/// Calls a body with the vectors of a row. The usual widths, 64 and 68 to 80, have code of their own, where rows stay in registers;
+/// the others share one with loops.
+macro_rules! by_vectors {
+    ($body:ident, $s:ident, $t:ident, $d:expr) => {
+        match padded_d($d) / LANES {
+            4 => $body($s, $t, 4),
+            5 => $body($s, $t, 5),
+            n => $body($s, $t, n),
+        }
+    };
 }
 
 /// Gain, offset and eps of the norm of q or of k.
@@ -51,76 +72,119 @@ pub(crate) struct HeadRows<'a> {
     pub rotation: Option<Rotation<'a>>,
 }
 
-/// Sixteen values from `at` on; beyond the end of `x` zeros.
+/// Sum of the lanes in every lane, with the bits of `simd::fold_add`: addition commutes, so all lanes fold alike.
 #[inline(always)]
-fn lanes<S: Simd>(s: S, x: &[f32], at: usize) -> S::V {
-    match x[at..].first_chunk::<LANES>() {
-        Some(v) => s.load(v),
-        None => {
-            let mut v = [0.0; LANES];
-            v[..x.len() - at].copy_from_slice(&x[at..]);
-            s.load(&v)
-        }
-    }
+fn fold_lanes<V: Vector>(v: V) -> V {
+    let v = v + v.swap::<8>();
+    let v = v + v.swap::<4>();
+    let v = v + v.swap::<2>();
+    v + v.swap::<1>()
 }
 
-/// 1 in the lanes of a head's last vector that belong to it, 0 behind.
+/// Largest lane in every lane.
 #[inline(always)]
-fn last_lanes(d: usize) -> [f32; LANES] {
-    let used = d - (d - 1) / LANES * LANES;
-    std::array::from_fn(|i| if i < used { 1.0 } else { 0.0 })
+fn largest_lane<V: Vector>(v: V) -> V {
+    let v = v.max(v.swap::<8>());
+    let v = v.max(v.swap::<4>());
+    let v = v.max(v.swap::<2>());
+    v.max(v.swap::<1>())
 }
 
-/// Norm, turn and rotation of rows -> `out` `[rows, padded d]` and 16 values more.
+/// Norm, turn and rotation of rows -> `out` `[rows, 16 n]` and 16 values more; zeros behind d.
 #[inline(always)]
-pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, out: &mut [f32]) {
+fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
     let HeadRows { x, stride, rows, d, norm, rope, rotation } = *t;
-    let (width, quarter) = (padded_d(d), d / 4);
-    let vectors = width / LANES;
-    let used = last_lanes(d);
-    let (mut gain, mut offset) = ([[0.0f32; LANES]; MAX_D / LANES], [[0.0f32; LANES]; MAX_D / LANES]);
-    if let Some(n) = norm {
-        gain.as_flattened_mut()[..d].copy_from_slice(n.gain);
-        offset.as_flattened_mut()[..d].copy_from_slice(n.offset);
+    let width = n * LANES;
+    let quarter = d / 4;
+    let (zero, half) = (s.splat(0.0), s.splat(0.5));
+    let (mut gain, mut offset) = ([[0.0f32; LANES]; MAX_N], [[0.0f32; LANES]; MAX_N]);
+    let mut used = [[0.0f32; LANES]; MAX_N];
+    used.as_flattened_mut()[..d].fill(1.0);
+    if let Some(norm) = norm {
+        gain.as_flattened_mut()[..d].copy_from_slice(norm.gain);
+        offset.as_flattened_mut()[..d].copy_from_slice(norm.offset);
     }
+    let count = s.splat(d as f32);
+    let eps = s.splat(norm.map_or(0.0, |n| n.eps));
     let mut row = [0.0f32; MAX_D + LANES];
     for r in 0..rows {
+        let mut v = [zero; MAX_N];
         let x = &x[r * stride..];
-        let (v, _) = row.as_chunks_mut::<LANES>();
-        for i in 0..vectors {
-            lanes(s, x, i * LANES).store(&mut v[i]);
+        if let Some(x) = x.as_chunks::<LANES>().0.get(..n) {
+            for i in 0..n {
+                v[i] = s.load(&x[i]);
+            }
+        } else {
+            // The last rows of q | k | v, where less than a padded row follows.
+            row[..d].copy_from_slice(&x[..d]);
+            for i in 0..n {
+                v[i] = s.load(&row.as_chunks::<LANES>().0[i]);
+            }
         }
-        let (half, zero) = (s.splat(0.5), s.splat(0.0));
-        let last = &mut v[vectors - 1];
-        s.load(&used).select_gt(half, s.load(last), zero).store(last);
-        if let Some(n) = norm {
-            standardize(s, &mut v[..vectors], (d, &used, n.eps));
-            for i in 0..vectors {
-                s.load(&v[i]).mul_add(s.load(&gain[i]), s.load(&offset[i])).store(&mut v[i]);
+        if d < width {
+            for i in 0..n {
+                v[i] = s.load(&used[i]).select_gt(half, v[i], zero);
+            }
+        }
+        if norm.is_some() {
+            // The bits of `layernorm::moments`: lanes that are not used add 0.
+            let mut sum = zero;
+            for i in 0..n {
+                sum = sum + v[i];
+            }
+            let mean = fold_lanes(sum) / count;
+            let mut squares = zero;
+            for i in 0..n {
+                v[i] = v[i] - mean;
+                if d < width {
+                    v[i] = s.load(&used[i]).select_gt(half, v[i], zero);
+                }
+                squares = v[i].mul_add(v[i], squares);
+            }
+            let k = s.splat(1.0) / (fold_lanes(squares) / count + eps).sqrt();
+            for i in 0..n {
+                v[i] = (v[i] * k).mul_add(s.load(&gain[i]), s.load(&offset[i]));
             }
         }
         let out = &mut out[r * width..][..width + LANES];
         match rope {
-            None => out[..width].copy_from_slice(&row[..width]),
+            Some((table, first)) if n == 4 && d == 4 * LANES => {
+                // Halves of two whole vectors.
+                let (cos, sin) = table.lanes((first + r) % table.len());
+                let (cos, sin) = (cos.as_chunks::<LANES>().0, sin.as_chunks::<LANES>().0);
+                for h in 0..2 {
+                    (v[2 * h], v[2 * h + 1]) = turn(v[2 * h], v[2 * h + 1], s.load(&cos[h]), s.load(&sin[h]), zero);
+                }
+            }
             Some((table, first)) => {
                 let (cos, sin) = table.lanes((first + r) % table.len());
+                let at = |x: &[f32], i: usize| s.load(x[i..].first_chunk().expect("a vector of slack"));
+                for i in 0..n {
+                    v[i].store(row[i * LANES..].first_chunk_mut().expect("a vector of slack"));
+                }
                 for h in 0..2 {
                     let base = 2 * h * quarter;
                     // All of the first outputs, then all of the second: what a store writes too far is written again.
                     for side in 0..2 {
                         for j in (0..quarter).step_by(LANES) {
-                            let (a, b) = (lanes(s, &row, base + j), lanes(s, &row, base + quarter + j));
-                            let (c, n) = (lanes(s, cos, h * quarter + j), lanes(s, sin, h * quarter + j));
-                            let (p, q) = turn(a, b, c, n, zero);
+                            let (a, b) = (at(&row, base + j), at(&row, base + quarter + j));
+                            let (p, q) = turn(a, b, at(cos, h * quarter + j), at(sin, h * quarter + j), zero);
                             let to = out[base + side * quarter + j..].first_chunk_mut().expect("a vector of slack");
                             if side == 0 { p } else { q }.store(to);
                         }
                     }
                 }
-                if d < width {
-                    zero.store(out[d..].first_chunk_mut().expect("a vector of slack"));
+                for i in 0..n {
+                    v[i] = at(out, i * LANES);
+                    if d < width {
+                        v[i] = s.load(&used[i]).select_gt(half, v[i], zero);
+                    }
                 }
             }
+            None => {}
+        }
+        for i in 0..n {
+            v[i].store(out[i * LANES..].first_chunk_mut().expect("whole vectors"));
         }
         if let Some(rotation) = rotation {
             rotate(s, &mut out[..d], rotation.signs(), rotation.block());
@@ -128,99 +192,91 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, out: &mut [f32]) {
     }
 }
 
-/// (x - mean) / sqrt(var + eps) over d values in whole vectors, in place, with the bits of `layernorm::moments`.
+/// Mean over the rows of `x` `[rows, 16 n]`, each column summed in the order of the rows.
 #[inline(always)]
-fn standardize<S: Simd>(s: S, v: &mut [[f32; LANES]], (d, used, eps): (usize, &[f32; LANES], f32)) {
-    let n = d as f32;
-    let mut sum = s.splat(0.0);
-    for x in v.iter() {
-        sum = sum + s.load(x);
-    }
-    let mean = s.splat(fold_add(sum) / n);
-    let mut squares = s.splat(0.0);
-    let last = v.len() - 1;
-    let inside = s.load(used);
-    for (i, x) in v.iter_mut().enumerate() {
-        let mut x_i = s.load(x);
-        if i == last {
-            x_i = inside.select_gt(s.splat(0.5), x_i, mean);
-        }
-        let e = x_i - mean;
-        squares = e.mul_add(e, squares);
-        e.store(x);
-    }
-    let k = s.splat(1.0 / (fold_add(squares) / n + eps).sqrt());
-    for x in v.iter_mut() {
-        (s.load(x) * k).store(x);
-    }
-}
-
-/// Sums over the rows of `N` vectors of columns, in the order of the rows.
-#[inline(always)]
-fn column_sums<S: Simd, const N: usize>(s: S, x: &[f32], width: usize, out: &mut [[f32; LANES]; N]) {
-    let mut sums = [s.splat(0.0); N];
-    for row in x.chunks(width) {
-        let row = row.as_chunks::<LANES>().0.first_chunk::<N>().expect("whole rows");
-        for i in 0..N {
+fn column_means<S: Simd>(s: S, x: &[f32], n: usize, mean: &mut [[f32; LANES]]) {
+    let mut sums = [s.splat(0.0); MAX_N];
+    let mut rows = 0.0;
+    for row in x.as_chunks::<LANES>().0.chunks_exact(n) {
+        for i in 0..n {
             sums[i] = sums[i] + s.load(&row[i]);
         }
+        rows += 1.0;
     }
-    for i in 0..N {
-        sums[i].store(&mut out[i]);
-    }
-}
-
-/// Mean over the rows of `x` `[rows, width]`, each column summed in the order of the rows.
-#[inline(always)]
-fn column_means<S: Simd>(s: S, x: &[f32], rows: usize, mean: &mut [f32]) {
-    let width = mean.len();
-    let x = &x[..rows * width];
-    let mut c = 0;
-    while c < width {
-        let left = mean[c..].as_chunks_mut::<LANES>().0;
-        if let Some(four) = left.first_chunk_mut::<4>() {
-            column_sums(s, &x[c..], width, four);
-            c += 4 * LANES;
-        } else {
-            column_sums(s, &x[c..], width, left.first_chunk_mut::<1>().expect("whole vectors"));
-            c += LANES;
-        }
-    }
-    let n = s.splat(rows as f32);
-    for m in mean.as_chunks_mut::<LANES>().0 {
-        (s.load(m) / n).store(m);
+    let rows = s.splat(rows);
+    for i in 0..n {
+        (sums[i] / rows).store(&mut mean[i]);
     }
 }
 
 /// x - mean to int8, with the bits of [`crate::reference::quantize`]; returns the scale.
 #[inline(always)]
-fn quantize_centred<S: Simd>(s: S, x: &[f32], mean: &[f32], out: &mut [i8]) -> f32 {
+fn quantize_centred<S: Simd>(s: S, x: &[[f32; LANES]], mean: Option<&[[f32; LANES]]>, out: &mut [[i8; LANES]]) -> f32 {
+    let n = x.len();
     let zero = s.splat(0.0);
-    let (x, mean) = (x.as_chunks::<LANES>().0, mean.as_chunks::<LANES>().0);
+    let mut v = [zero; MAX_N];
     let (mut max, mut odd) = (zero, zero);
-    for (x, m) in x.iter().zip(mean) {
-        let v = s.load(x) - s.load(m);
-        max = v.abs().max(max);
+    for i in 0..n {
+        v[i] = s.load(&x[i]);
+        if let Some(mean) = mean {
+            v[i] = v[i] - s.load(&mean[i]);
+        }
+        max = v[i].abs().max(max);
         // NaN for NaN and infinities, and stays so.
-        odd = v.mul_add(zero, odd);
+        odd = v[i].mul_add(zero, odd);
     }
-    let max = max.max(max.swap::<8>());
-    let max = max.max(max.swap::<4>());
-    let max = max.max(max.swap::<2>());
-    let max = max.max(max.swap::<1>());
-    let mut m = [0.0; LANES];
-    max.store(&mut m);
-    let finite = s.splat(1.0).gt_bits(odd) == u16::MAX;
-    let inverse = 127.0 / m[0];
-    if !finite || !inverse.is_finite() {
-        out.fill(0);
+    let max = largest_lane(max);
+    let out = &mut out[..n];
+    let top = s.splat(127.0);
+    let inverse = top / max;
+    // Both sides of 127 / max must be finite, and every value.
+    let (finite, small) = (s.splat(1.0).gt_bits(odd) == u16::MAX, inverse.gt_bits(s.splat(f32::MAX)) != 0);
+    if !finite || small {
+        out.fill([0; LANES]);
         return if finite { 0.0 } else { f32::NAN };
     }
-    let k = s.splat(inverse);
-    for ((x, m), y) in x.iter().zip(mean).zip(out.as_chunks_mut::<LANES>().0) {
-        clamp(s, (s.load(x) - s.load(m)) * k).store_s8(y);
+    for i in 0..n {
+        clamp(s, v[i] * inverse).store_s8(&mut out[i]);
     }
-    m[0] / 127.0
+    let mut scale = [0.0; LANES];
+    (max / top).store(&mut scale);
+    scale[0]
+}
+
+/// Bytes of up to 16 rows `[16, blocks of 64]` -> quads `[steps][stride]` from `out` on, transposed; rows beyond `rows` are zeros.
+#[inline(always)]
+fn transpose_quads<S: Simd>(s: S, bytes: &[f32], (blocks, steps): (usize, usize), out: &mut [u32], stride: usize) {
+    let rows = bytes.as_chunks::<LANES>().0;
+    for b in 0..blocks {
+        let mut block = [[0.0f32; LANES]; LANES];
+        for r in 0..LANES {
+            // Through a register: copied as arrays, these 64 bytes become calls of memcpy.
+            s.load(&rows[r * blocks + b]).store(&mut block[r]);
+        }
+        s.transpose(&mut block);
+        for (i, quads) in block.iter().enumerate().take(steps - b * LANES) {
+            let to = out[(b * LANES + i) * stride..].first_chunk_mut::<LANES>().expect("a vector of slack");
+            s.load(quads).store(bytemuck::cast_mut(to));
+        }
+    }
+}
+
+/// Quads `[steps][stride]` of `rows` rows, cut into the tiles of a kernel: for each tile `[steps][rows of the tile]`.
+#[inline(always)]
+fn cut_tiles(stage: &[u32], stride: usize, (steps, rows): (usize, usize), kernel: &GemmS8Kernel, out: &mut [u32]) {
+    let flip = flip(kernel);
+    for r in (0..rows).step_by(kernel.mr) {
+        let width = kernel.fit(kernel.mr.min(rows - r));
+        let out = &mut out[r * steps..][..width * steps];
+        for (q, from) in stage[r..].chunks(stride).enumerate().take(steps) {
+            let quads = from.first_chunk::<LANES>().expect("a vector of slack").map(|v| v ^ flip);
+            // Sixteen at once where there is room: what runs over is written again by the next step.
+            match out[q * width..].first_chunk_mut::<LANES>() {
+                Some(to) => *to = quads,
+                None => out[q * width..][..width].copy_from_slice(&quads[..width]),
+            }
+        }
+    }
 }
 
 /// Flips a byte quad of activations to the form that a kernel wants.
@@ -239,8 +295,10 @@ pub(crate) struct KeyPack<'a> {
     pub kernel: &'static GemmS8Kernel,
     /// `[rows, padded d]` and 16 more.
     pub work: &'a mut [f32],
-    /// `[16, padded d]`.
-    pub bytes: &'a mut [i8],
+    /// `[16, padded bytes]`.
+    pub bytes: &'a mut [f32],
+    /// `[d/4, STAGE_ROWS]` quads.
+    pub stage: &'a mut [u32],
     /// Mean key, `[padded d]`.
     pub mean: &'a mut [f32],
     /// Scale of each key, `[rows]`.
@@ -252,27 +310,29 @@ pub(crate) struct KeyPack<'a> {
 /// Prepares keys, takes their mean off and packs them.
 #[inline(always)]
 pub(crate) fn pack_keys<S: Simd>(s: S, t: KeyPack) {
-    let KeyPack { rows: head, kernel, work, bytes, mean, scales, out } = t;
-    let (width, steps, rows) = (padded_d(head.d), head.d / QUAD, head.rows);
-    prepare(s, &head, work);
-    column_means(s, work, rows, mean);
-    let flip = flip(kernel);
+    by_vectors!(pack_keys_of, s, t, t.rows.d);
+}
+
+#[inline(always)]
+fn pack_keys_of<S: Simd>(s: S, t: KeyPack, n: usize) {
+    let KeyPack { rows: head, kernel, work, bytes, stage, mean, scales, out } = t;
+    let (steps, rows) = (head.d / QUAD, head.rows);
+    prepare(s, &head, n, work);
+    let mean = &mut mean.as_chunks_mut::<LANES>().0[..n];
+    column_means(s, &work[..rows * n * LANES], n, mean);
+    let blocks = n.div_ceil(QUAD);
     for first in (0..rows).step_by(KEYS) {
         let keys = KEYS.min(rows - first);
-        for r in (0..keys).step_by(kernel.mr) {
-            let here = kernel.mr.min(keys - r);
-            let at = first + r;
-            for i in 0..here {
-                let x = &work[(at + i) * width..][..width];
-                scales[at + i] = quantize_centred(s, x, mean, &mut bytes[i * width..][..width]);
+        let work = &work.as_chunks::<LANES>().0[first * n..(first + keys) * n];
+        for r in (0..keys).step_by(LANES) {
+            let to: &mut [i8] = bytemuck::cast_slice_mut(&mut *bytes);
+            let to = to.as_chunks_mut::<LANES>().0.chunks_mut(blocks * QUAD);
+            for ((x, to), scale) in work[r * n..].chunks_exact(n).zip(to).zip(&mut scales[first + r..]) {
+                *scale = quantize_centred(s, x, Some(mean), to);
             }
-            let mut from: [&[i8]; MAX_MR] = [&[]; MAX_MR];
-            for (i, row) in from.iter_mut().enumerate().take(here) {
-                *row = &bytes[i * width..][..width];
-            }
-            let out = &mut out[at * steps..];
-            pack_quads(s, QuadPack { from, steps, width: kernel.fit(here), flip, out });
+            transpose_quads(s, bytes, (blocks, steps), &mut stage[r..], STAGE_ROWS);
         }
+        cut_tiles(stage, STAGE_ROWS, (steps, keys), kernel, &mut out[first * steps..]);
     }
 }
 
@@ -282,10 +342,8 @@ pub(crate) struct QueryPack<'a> {
     pub rows: HeadRows<'a>,
     /// `[16, padded d]` and 16 more; holds the prepared queries afterwards, zeros where there are none.
     pub work: &'a mut [f32],
-    /// `[16, padded d]`.
-    pub bytes: &'a mut [i8],
-    /// Zeros, `[padded d]`.
-    pub zeros: &'a [f32],
+    /// `[16, padded bytes]`.
+    pub bytes: &'a mut [f32],
     /// Scale of each query times this; 0 where there is none.
     pub factor: f32,
     /// Scales.
@@ -297,23 +355,21 @@ pub(crate) struct QueryPack<'a> {
 /// Prepares queries and packs them.
 #[inline(always)]
 pub(crate) fn pack_queries<S: Simd>(s: S, t: QueryPack) {
-    let QueryPack { rows: head, work, bytes, zeros, factor, scales, out } = t;
-    let width = padded_d(head.d);
-    prepare(s, &head, work);
-    work[head.rows * width..LANES * width].fill(0.0);
-    let mut from: [&[i8]; MAX_MR] = [&[]; MAX_MR];
-    for (i, scale) in scales.iter_mut().enumerate() {
-        *scale = if i < head.rows {
-            let y = &mut bytes[i * width..][..width];
-            quantize_centred(s, &work[i * width..][..width], zeros, y) * factor
-        } else {
-            0.0
-        };
+    by_vectors!(pack_queries_of, s, t, t.rows.d);
+}
+
+#[inline(always)]
+fn pack_queries_of<S: Simd>(s: S, t: QueryPack, n: usize) {
+    let QueryPack { rows: head, work, bytes, factor, scales, out } = t;
+    prepare(s, &head, n, work);
+    work[head.rows * n * LANES..LANES * n * LANES].fill(0.0);
+    let blocks = n.div_ceil(QUAD);
+    let to: &mut [i8] = bytemuck::cast_slice_mut(&mut *bytes);
+    let to = to.as_chunks_mut::<LANES>().0.chunks_mut(blocks * QUAD);
+    for ((x, to), scale) in work.as_chunks::<LANES>().0.chunks_exact(n).zip(to).zip(scales.iter_mut()) {
+        *scale = quantize_centred(s, x, None, to) * factor;
     }
-    for (i, row) in from.iter_mut().enumerate().take(head.rows) {
-        *row = &bytes[i * width..][..width];
-    }
-    pack_quads(s, QuadPack { from, steps: head.d / QUAD, width: LANES, flip: 0, out });
+    transpose_quads(s, bytes, (blocks, head.d / QUAD), out, LANES);
 }
 
 /// Values of one frame and head, to be packed as activations of the tiles that sum them.
@@ -347,52 +403,66 @@ pub(crate) fn value_tile_len(kernel: &GemmS8Kernel, d: usize) -> usize {
 pub(crate) fn pack_values<S: Simd>(s: S, t: ValuePack) {
     let ValuePack { x, stride, rows, d, kernel, stage, columns, out } = t;
     let width = padded_d(d);
-    let flip = flip(kernel);
     let tile_len = value_tile_len(kernel, d);
-    let (zero, round) = (s.splat(0.0), s.splat(ROUND));
+    // Sixteen channels of the keys, in memory of their own: rows are far apart, and the last may end early.
+    let mut block = [[0.0f32; LANES]; KEYS];
     for (tile, first) in (0..rows).step_by(KEYS).enumerate() {
         let keys = KEYS.min(rows - first);
         let steps = keys.div_ceil(QUAD);
-        let x = &x[first * stride..];
+        block[keys..].fill([0.0; LANES]);
         let (scales, sums) = columns[tile * 2 * width..][..2 * width].split_at_mut(width);
         for c in (0..d).step_by(LANES) {
-            let (mut max, mut odd) = (zero, zero);
-            for r in 0..keys {
-                let v = lanes(s, x, r * stride + c);
-                max = v.abs().max(max);
-                odd = v.mul_add(zero, odd);
-            }
-            // As in `quantize`: a true division; nothing to scale where it overflows. NaN where a value is not finite.
-            let inverse = s.splat(127.0) / max;
-            let inverse = inverse.select_gt(s.splat(f32::MAX), zero, inverse);
-            (max / s.splat(127.0) + odd).store(scales[c..].first_chunk_mut().expect("whole vectors"));
-            let mut sum = zero;
-            for q in 0..steps {
-                let mut quad = [round; 4];
-                for (i, y) in quad.iter_mut().enumerate().take(keys - q * QUAD) {
-                    // NaN becomes -127 here, for the scale is NaN.
-                    let v = (lanes(s, x, (q * QUAD + i) * stride + c) * inverse).max(s.splat(-127.0));
-                    *y = v.select_gt(s.splat(127.0), s.splat(127.0), v) + round;
-                    sum = sum + (*y - round);
+            let x = &x[first * stride + c..];
+            for (to, row) in block.iter_mut().zip(x.chunks(stride)).take(keys) {
+                match row.first_chunk::<LANES>() {
+                    Some(row) => s.load(row).store(to),
+                    None => to[..row.len()].copy_from_slice(row),
                 }
-                let to = stage[q * width + c..].first_chunk_mut::<LANES>().expect("whole vectors");
-                S::V::store_low_bytes(quad, bytemuck::cast_mut(to));
             }
-            (sum * s.splat(127.0)).store(sums[c..].first_chunk_mut().expect("whole vectors"));
+            let (scale, sum) = (scales[c..].first_chunk_mut(), sums[c..].first_chunk_mut());
+            let columns = (scale.expect("whole vectors"), sum.expect("whole vectors"));
+            quantize_columns(s, (&block, keys), columns, (&mut stage[c..], width));
         }
-        let out = &mut out[tile * tile_len..][..tile_len];
-        for r in (0..d).step_by(kernel.mr) {
-            let tile_rows = kernel.fit(kernel.mr.min(d - r));
-            let out = &mut out[r * steps..][..tile_rows * steps];
-            for q in 0..steps {
-                let from = stage[q * width + r..].first_chunk::<LANES>().expect("a vector of slack");
-                let quads = from.map(|v| v ^ flip);
-                // Sixteen at once where there is room: what runs over is written again by the next step.
-                match out[q * tile_rows..].first_chunk_mut::<LANES>() {
-                    Some(to) => *to = quads,
-                    None => out[q * tile_rows..][..tile_rows].copy_from_slice(&quads[..tile_rows]),
-                }
-            }
+        cut_tiles(stage, width, (steps, d), kernel, &mut out[tile * tile_len..][..tile_len]);
+    }
+}
+
+/// Sixteen columns of up to 64 rows to int8 -> quads of four rows, `[keys/4][stride]`; scales and 127 times the sums.
+#[inline(always)]
+fn quantize_columns<S: Simd>(
+    s: S,
+    (x, rows): (&[[f32; LANES]; KEYS], usize),
+    (scales, sums): (&mut [f32; LANES], &mut [f32; LANES]),
+    (out, stride): (&mut [u32], usize),
+) {
+    let zero = s.splat(0.0);
+    // Two chains: a maximum does not depend on order, nor does whether something is not finite.
+    let (mut max, mut odd) = ([zero; 2], [zero; 2]);
+    for pair in x[..rows.next_multiple_of(2)].as_chunks::<2>().0 {
+        for i in 0..2 {
+            let v = s.load(&pair[i]);
+            max[i] = v.abs().max(max[i]);
+            odd[i] = v.mul_add(zero, odd[i]);
         }
     }
+    let max = max[0].max(max[1]);
+    let (top, bottom, round) = (s.splat(127.0), s.splat(-127.0), s.splat(ROUND));
+    // As in `quantize`: a true division; nothing to scale where it overflows. NaN where a value is not finite.
+    let inverse = top / max;
+    let inverse = inverse.select_gt(s.splat(f32::MAX), zero, inverse);
+    (max / top + (odd[0] + odd[1])).store(scales);
+    let mut sum = zero;
+    // Rows behind the last are zeros.
+    for (quad, out) in x.as_chunks::<QUAD>().0[..rows.div_ceil(QUAD)].iter().zip(out.chunks_mut(stride)) {
+        let mut y = [zero; QUAD];
+        for i in 0..QUAD {
+            // NaN becomes -127 here, for the scale is NaN.
+            let v = (s.load(&quad[i]) * inverse).max(bottom);
+            y[i] = v.select_gt(top, top, v) + round;
+            sum = sum + (y[i] - round);
+        }
+        let to = out.first_chunk_mut::<LANES>().expect("whole vectors");
+        S::V::store_low_bytes(y, bytemuck::cast_mut(to));
+    }
+    (sum * top).store(sums);
 }

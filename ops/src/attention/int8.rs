@@ -28,7 +28,9 @@
 //! values (and of the keys counted) is added back exactly.
 
 use super::FrameMask;
-use super::heads::{HeadNorm, HeadRows, KEYS, KeyPack, MAX_D, QueryPack, ValuePack, padded_d, value_tile_len};
+use super::heads::{
+    HeadNorm, HeadRows, KEYS, KeyPack, MAX_D, QueryPack, STAGE_ROWS, ValuePack, padded_bytes, padded_d, value_tile_len,
+};
 use super::integers::{Place, Watch};
 use super::softmax::{MergeS8, Rows, WEIGHT_ZERO, WeightsS8};
 use crate::cpu::{Ctx, Kernels};
@@ -125,17 +127,17 @@ struct Room {
 /// Pieces of the working memory of a thread while it packs: prepared rows, bytes, quads.
 fn packing_lens(tokens: usize, d: usize) -> [usize; 3] {
     let width = padded_d(d);
-    [tokens * width + LINE, LANES * width / QUAD, KEYS / QUAD * width + LINE].map(|n| n.next_multiple_of(LINE))
+    let stage = (KEYS / QUAD * width + LINE).max(d / QUAD * STAGE_ROWS);
+    [tokens * width + LINE, LANES * padded_bytes(d) / QUAD, stage].map(|n| n.next_multiple_of(LINE))
 }
 
-/// Pieces of the working memory of a thread while it multiplies: prepared rows, bytes, zeros, panels of queries, queries in f32,
+/// Pieces of the working memory of a thread while it multiplies: prepared rows, bytes, panels of queries, queries in f32,
 /// scores, weights, sums, running sums.
-fn block_lens(d: usize) -> [usize; 9] {
+fn block_lens(d: usize) -> [usize; 8] {
     let width = padded_d(d);
     [
         LANES * width + LINE,
-        LANES * width / QUAD,
-        width,
+        LANES * padded_bytes(d) / QUAD,
         QUERIES * d / QUAD,
         QUERIES * d,
         PANELS * SCORE_ROWS * NR,
@@ -246,7 +248,8 @@ impl<'a> Job<'a> {
             rows: self.head_rows(1, Block { frame, head, first: 0 }, tokens),
             kernel,
             work,
-            bytes: bytemuck::cast_slice_mut(bytes),
+            bytes,
+            stage: bytemuck::cast_slice_mut(&mut *stage),
             mean: &mut mean[..padded_d(d)],
             scales: &mut scales[..tokens],
             out: bytemuck::cast_slice_mut(k),
@@ -315,10 +318,9 @@ impl<'a> Job<'a> {
             }
             return;
         }
-        let [work, bytes, zeros, q, q_f32, scores, weights, sums, acc] = pieces(memory, block_lens(d));
+        let [work, bytes, q, q_f32, scores, weights, sums, acc] = pieces(memory, block_lens(d));
         let (steps, room) = (d / QUAD, &self.room);
         let q: &mut [u32] = bytemuck::cast_slice_mut(q);
-        let bytes: &mut [i8] = bytemuck::cast_slice_mut(bytes);
         let mut run = Running {
             scales: [[0.0; LANES]; PANELS],
             start: [[0; LANES]; PANELS],
@@ -327,7 +329,6 @@ impl<'a> Job<'a> {
             total: [[0.0; LANES]; PANELS],
         };
         let factor = self.x.factor(d);
-        zeros.fill(0.0);
         for p in 0..panels {
             let rows = NR.min(queries - p * NR);
             let panel = &mut q[p * steps * NR..][..steps * NR];
@@ -335,7 +336,6 @@ impl<'a> Job<'a> {
                 rows: self.head_rows(0, Block { first: at.first + p * NR, ..at }, rows),
                 work,
                 bytes,
-                zeros,
                 factor,
                 scales: &mut run.scales[p],
                 out: &mut *panel,
