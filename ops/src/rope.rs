@@ -6,12 +6,12 @@
 //! out_m = a_m cos - a_(m+D/2) sin, out_(m+D/2) = a_(m+D/2) cos + a_m sin.
 //! Tables are computed in f64 with [`crate::trig`] and stored as f32.
 
+use crate::attention::heads::{HeadNorm, HeadRows, MAX_D, Turn, by_vectors, padded_d, prepare};
 use crate::cpu::Ctx;
-use crate::layernorm::moments;
 use crate::mat::MatMut;
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
-use crate::simd::{LANES, Simd, Vector, padded};
+use crate::simd::{LANES, Simd, Vector};
 use crate::trig;
 
 /// What happens to an angle before its sine and cosine are taken.
@@ -116,12 +116,14 @@ pub struct QkNorm<'a> {
 pub(crate) struct RopeRow<'a> {
     /// q | k, `2 * heads * d` values.
     pub qk: &'a mut [f32],
+    /// `2 * heads` rows of padded width and 16 values more.
+    pub work: &'a mut [f32],
     /// Head width.
     pub d: usize,
     /// Norm of q and k.
     pub norm: Option<&'a QkNorm<'a>>,
-    /// cos and sin of the token, d/2 values each.
-    pub turn: Option<(&'a [f32], &'a [f32])>,
+    /// Table and token.
+    pub turn: Option<(&'a RopeTable, usize)>,
 }
 
 /// a cos - b sin and b cos + a sin; the second product is rounded, the first fused.
@@ -133,50 +135,33 @@ pub(crate) fn turn<V: Vector>(a: V, b: V, cos: V, sin: V, zero: V) -> (V, V) {
 /// Norm, then rotation, of every head of one token.
 #[inline(always)]
 pub(crate) fn rope_row<S: Simd>(s: S, row: RopeRow) {
-    let RopeRow { qk, d, norm, turn: table } = row;
-    let half = qk.len() / 2;
-    let zero = s.splat(0.0);
-    let quarter = d / 4;
-    for (i, x) in qk.chunks_exact_mut(d).enumerate() {
-        if let Some(n) = norm {
-            let (gain, offset) = if i * d < half { (n.q_gain, n.q_offset) } else { (n.k_gain, n.k_offset) };
-            let (mean, scale) = moments(s, x, n.eps);
-            let (m, k) = (s.splat(mean), s.splat(scale));
-            let (xb, xt) = x.as_chunks_mut::<LANES>();
-            let (gb, gt) = gain.as_chunks::<LANES>();
-            let (ob, ot) = offset.as_chunks::<LANES>();
-            for ((x, g), o) in xb.iter_mut().zip(gb).zip(ob) {
-                ((s.load(x) - m) * k).mul_add(s.load(g), s.load(o)).store(x);
-            }
-            if !xt.is_empty() {
-                let mut y = [0.0; LANES];
-                let v = (s.load(&padded(xt, mean)) - m) * k;
-                v.mul_add(s.load(&padded(gt, 0.0)), s.load(&padded(ot, 0.0))).store(&mut y);
-                xt.copy_from_slice(&y[..xt.len()]);
-            }
-        }
-        let Some((cos, sin)) = table else { continue };
-        for h in 0..2 {
-            let (a, b) = x[2 * h * quarter..][..2 * quarter].split_at_mut(quarter);
-            let (cos, sin) = (&cos[h * quarter..][..quarter], &sin[h * quarter..][..quarter]);
-            let (ab, at) = a.as_chunks_mut::<LANES>();
-            let (bb, bt) = b.as_chunks_mut::<LANES>();
-            let (cb, ct) = cos.as_chunks::<LANES>();
-            let (sb, st) = sin.as_chunks::<LANES>();
-            for (((a, b), c), sn) in ab.iter_mut().zip(bb).zip(cb).zip(sb) {
-                let (p, q) = turn(s.load(a), s.load(b), s.load(c), s.load(sn), zero);
-                p.store(a);
-                q.store(b);
-            }
-            if !at.is_empty() {
-                let at_lanes = s.load(&padded(at, 0.0));
-                let bt_lanes = s.load(&padded(bt, 0.0));
-                let (p, q) = turn(at_lanes, bt_lanes, s.load(&padded(ct, 0.0)), s.load(&padded(st, 0.0)), zero);
-                let mut y = [0.0; LANES];
-                p.store(&mut y);
-                at.copy_from_slice(&y[..at.len()]);
-                q.store(&mut y);
-                bt.copy_from_slice(&y[..bt.len()]);
+    by_vectors!(rope_row_of, s, row, row.d);
+}
+
+#[inline(always)]
+fn rope_row_of<S: Simd>(s: S, row: RopeRow, n: usize) {
+    let RopeRow { qk, work, d, norm, turn } = row;
+    let (part, width) = (qk.len() / 2, n * LANES);
+    let heads = part / d;
+    let rope = turn.map(|(table, first)| Turn { table, first, step: 0 });
+    for p in 0..2 {
+        let norm = norm.map(|n| {
+            let (gain, offset) = if p == 0 { (n.q_gain, n.q_offset) } else { (n.k_gain, n.k_offset) };
+            HeadNorm { gain, offset, eps: n.eps }
+        });
+        let rows = HeadRows { x: &qk[p * part..], stride: d, rows: heads, d, norm, rope, rotation: None };
+        prepare(s, &rows, n, &mut work[p * heads * width..]);
+    }
+    for (i, from) in work.chunks_exact(width).take(2 * heads).enumerate() {
+        for (j, lanes) in from.as_chunks::<LANES>().0.iter().enumerate() {
+            // What runs over into the next head is written again by it.
+            let to = &mut qk[i * d + j * LANES..];
+            match to.first_chunk_mut::<LANES>() {
+                Some(to) => s.load(lanes).store(to),
+                None => {
+                    let left = to.len();
+                    to.copy_from_slice(&lanes[..left]);
+                }
             }
         }
     }
@@ -185,7 +170,7 @@ pub(crate) fn rope_row<S: Simd>(s: S, row: RopeRow) {
 /// Rows of one task.
 const TASK_ROWS: usize = 16;
 
-/// Norm then rotation of the q and k parts of `qkv` `[rows, 3 * heads * d]`, in place; row r uses table entry
+/// Norm then rotation of the q and k parts of `qkv` `[rows, 3 * heads * d]`, d at most 256, in place; row r uses table entry
 /// r modulo the table's length.
 pub fn qk_norm_rope(ctx: Ctx, qkv: MatMut, heads: usize, norm: Option<QkNorm>, rope: Option<&RopeTable>) {
     let MatMut { data, rows, cols, stride } = qkv;
@@ -203,14 +188,19 @@ pub fn qk_norm_rope(ctx: Ctx, qkv: MatMut, heads: usize, norm: Option<QkNorm>, r
         return;
     }
     let _span = opclock::span(Op::Norm, || Work::values(rows * 2 * heads * d));
+    assert!(d <= MAX_D, "head width {d}, {MAX_D} at most");
     let shared = SharedMut::new(data);
-    ctx.pool.run(rows.div_ceil(TASK_ROWS), &|task, _| {
-        for r in task * TASK_ROWS..((task + 1) * TASK_ROWS).min(rows) {
-            // SAFETY: rows are disjoint and each belongs to one task.
-            #[allow(unsafe_code)]
-            let qk = unsafe { shared.slice(r * stride..r * stride + 2 * heads * d) };
-            let turn = rope.map(|t| t.entry(r % t.len()));
-            ctx.kernels.rope(RopeRow { qk, d, norm: norm.as_ref(), turn });
-        }
+    let scratch = 2 * heads * padded_d(d) + LANES;
+    ctx.pool.reserve_scratch(scratch);
+    ctx.pool.run(rows.div_ceil(TASK_ROWS), &|task, worker| {
+        ctx.pool.with_scratch(worker, scratch, |work| {
+            for r in task * TASK_ROWS..((task + 1) * TASK_ROWS).min(rows) {
+                // SAFETY: rows are disjoint and each belongs to one task.
+                #[allow(unsafe_code)]
+                let qk = unsafe { shared.slice(r * stride..r * stride + 2 * heads * d) };
+                let turn = rope.map(|t| (t, r));
+                ctx.kernels.rope(RopeRow { qk, work: &mut *work, d, norm: norm.as_ref(), turn });
+            }
+        });
     });
 }

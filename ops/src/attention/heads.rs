@@ -1,14 +1,14 @@
 //! One head of q, k or v on its way into the int8 tiles: norm, rotary embedding, rotation, quantization, packing.
 //!
 //! Rows of a head are worked on at a width of d rounded up to 16, zeros behind d, so that everything runs in whole
-//! vectors. The norm and the turn have the bits of [`crate::rope::qk_norm_rope`].
+//! vectors. Norm and embedding are also those of [`crate::rope::qk_norm_rope`].
 
 use crate::gemm::s8::pack::QUAD;
 use crate::gemm::s8::table::{Activations, GemmS8Kernel};
 use crate::hadamard::{Rotation, rotate};
 use crate::quantize::clamp;
 use crate::rope::{RopeTable, turn};
-use crate::simd::{LANES, Simd, Vector};
+use crate::simd::{LANES, Simd, Vector, fold_lanes};
 
 /// Widest head.
 pub(crate) const MAX_D: usize = 256;
@@ -37,7 +37,7 @@ const MAX_N: usize = MAX_D / LANES;
 /// the others share one with loops.
 macro_rules! by_vectors {
     ($body:ident, $s:ident, $t:ident, $d:expr) => {
-        match padded_d($d) / LANES {
+        match crate::attention::heads::padded_d($d) / crate::simd::LANES {
             4 => $body($s, $t, 4),
             5 => $body($s, $t, 5),
             n => $body($s, $t, n),
@@ -45,12 +45,22 @@ macro_rules! by_vectors {
     };
 }
 
+pub(crate) use by_vectors;
+
 /// Gain, offset and eps of the norm of q or of k.
 #[derive(Clone, Copy)]
 pub(crate) struct HeadNorm<'a> {
     pub gain: &'a [f32],
     pub offset: &'a [f32],
     pub eps: f32,
+}
+
+/// Rotary embedding of rows: row r turns as token first + r * step of the table, modulo its length.
+#[derive(Clone, Copy)]
+pub(crate) struct Turn<'a> {
+    pub table: &'a RopeTable,
+    pub first: usize,
+    pub step: usize,
 }
 
 /// Rows of one head of q or k, and what happens to them.
@@ -66,19 +76,10 @@ pub(crate) struct HeadRows<'a> {
     pub d: usize,
     /// Norm.
     pub norm: Option<HeadNorm<'a>>,
-    /// Table, and the row that counts as its token 0 modulo its length.
-    pub rope: Option<(&'a RopeTable, usize)>,
+    /// Rotary embedding.
+    pub rope: Option<Turn<'a>>,
     /// Rotation without its factor.
     pub rotation: Option<Rotation<'a>>,
-}
-
-/// Sum of the lanes in every lane, with the bits of `simd::fold_add`: addition commutes, so all lanes fold alike.
-#[inline(always)]
-fn fold_lanes<V: Vector>(v: V) -> V {
-    let v = v + v.swap::<8>();
-    let v = v + v.swap::<4>();
-    let v = v + v.swap::<2>();
-    v + v.swap::<1>()
 }
 
 /// Largest lane in every lane.
@@ -92,18 +93,22 @@ fn largest_lane<V: Vector>(v: V) -> V {
 
 /// Norm, turn and rotation of rows -> `out` `[rows, 16 n]` and 16 values more; zeros behind d.
 #[inline(always)]
-fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
+pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
     let HeadRows { x, stride, rows, d, norm, rope, rotation } = *t;
     let width = n * LANES;
     let quarter = d / 4;
     let (zero, half) = (s.splat(0.0), s.splat(0.5));
-    let (mut gain, mut offset) = ([[0.0f32; LANES]; MAX_N], [[0.0f32; LANES]; MAX_N]);
     let mut used = [[0.0f32; LANES]; MAX_N];
     used.as_flattened_mut()[..d].fill(1.0);
-    if let Some(norm) = norm {
-        gain.as_flattened_mut()[..d].copy_from_slice(norm.gain);
-        offset.as_flattened_mut()[..d].copy_from_slice(norm.offset);
-    }
+    let (gain, offset) = norm.map_or((&[][..], &[][..]), |n| (n.gain, n.offset));
+    let (mut padded_gain, mut padded_offset) = ([[0.0f32; LANES]; MAX_N], [[0.0f32; LANES]; MAX_N]);
+    let (gain, offset) = if d == width {
+        (gain.as_chunks::<LANES>().0, offset.as_chunks::<LANES>().0)
+    } else {
+        padded_gain.as_flattened_mut()[..gain.len()].copy_from_slice(gain);
+        padded_offset.as_flattened_mut()[..offset.len()].copy_from_slice(offset);
+        (&padded_gain[..n], &padded_offset[..n])
+    };
     let count = s.splat(d as f32);
     let eps = s.splat(norm.map_or(0.0, |n| n.eps));
     let mut row = [0.0f32; MAX_D + LANES];
@@ -148,16 +153,16 @@ fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
         }
         let out = &mut out[r * width..][..width + LANES];
         match rope {
-            Some((table, first)) if n == 4 && d == 4 * LANES => {
+            Some(Turn { table, first, step }) if n == 4 && d == 4 * LANES => {
                 // Halves of two whole vectors.
-                let (cos, sin) = table.lanes((first + r) % table.len());
+                let (cos, sin) = table.lanes((first + r * step) % table.len());
                 let (cos, sin) = (cos.as_chunks::<LANES>().0, sin.as_chunks::<LANES>().0);
                 for h in 0..2 {
                     (v[2 * h], v[2 * h + 1]) = turn(v[2 * h], v[2 * h + 1], s.load(&cos[h]), s.load(&sin[h]), zero);
                 }
             }
-            Some((table, first)) => {
-                let (cos, sin) = table.lanes((first + r) % table.len());
+            Some(Turn { table, first, step }) => {
+                let (cos, sin) = table.lanes((first + r * step) % table.len());
                 let at = |x: &[f32], i: usize| s.load(x[i..].first_chunk().expect("a vector of slack"));
                 for i in 0..n {
                     v[i].store(row[i * LANES..].first_chunk_mut().expect("a vector of slack"));
@@ -268,14 +273,26 @@ fn cut_tiles(stage: &[u32], stride: usize, (steps, rows): (usize, usize), kernel
     for r in (0..rows).step_by(kernel.mr) {
         let width = kernel.fit(kernel.mr.min(rows - r));
         let out = &mut out[r * steps..][..width * steps];
-        for (q, from) in stage[r..].chunks(stride).enumerate().take(steps) {
-            let quads = from.first_chunk::<LANES>().expect("a vector of slack").map(|v| v ^ flip);
-            // Sixteen at once where there is room: what runs over is written again by the next step.
-            match out[q * width..].first_chunk_mut::<LANES>() {
-                Some(to) => *to = quads,
-                None => out[q * width..][..width].copy_from_slice(&quads[..width]),
-            }
+        let from = stage[r..].chunks(stride).take(steps);
+        match width {
+            0..=4 => cut_tile::<4>(from, (width, flip), out),
+            5..=8 => cut_tile::<8>(from, (width, flip), out),
+            _ => cut_tile::<16>(from, (width, flip), out),
         }
+    }
+}
+
+/// The first `width` quads of each step, `G` at once where there is room: what runs over is written again by the next step.
+#[inline(always)]
+fn cut_tile<'a, const G: usize>(steps: impl Iterator<Item = &'a [u32]>, (width, flip): (usize, u32), out: &mut [u32]) {
+    let mut at = 0;
+    for from in steps {
+        let quads = from.first_chunk::<G>().expect("a vector of slack").map(|v| v ^ flip);
+        match out[at..].first_chunk_mut::<G>() {
+            Some(to) => *to = quads,
+            None => out[at..at + width].copy_from_slice(&quads[..width]),
+        }
+        at += width;
     }
 }
 

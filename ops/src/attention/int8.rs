@@ -29,7 +29,8 @@
 
 use super::FrameMask;
 use super::heads::{
-    HeadNorm, HeadRows, KEYS, KeyPack, MAX_D, QueryPack, STAGE_ROWS, ValuePack, padded_bytes, padded_d, value_tile_len,
+    HeadNorm, HeadRows, KEYS, KeyPack, MAX_D, QueryPack, STAGE_ROWS, Turn, ValuePack, padded_bytes, padded_d,
+    value_tile_len,
 };
 use super::integers::{Place, Watch};
 use super::softmax::{MergeS8, Rows, WEIGHT_ZERO, WeightsS8};
@@ -37,7 +38,7 @@ use crate::cpu::{Ctx, Kernels};
 use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
 use crate::gemm::s8::pack::{QUAD, STEP};
 use crate::gemm::s8::table::Activations;
-use crate::gemm::s8::tile::{MAX_NV, TileS8};
+use crate::gemm::s8::tile::{ColumnS8, MAX_NV, TileS8};
 use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::hadamard::Rotation;
@@ -235,7 +236,15 @@ impl<'a> Job<'a> {
             let (gain, offset) = if part == 0 { (n.q_gain, n.q_offset) } else { (n.k_gain, n.k_offset) };
             HeadNorm { gain, offset, eps: n.eps }
         });
-        HeadRows { x, stride: qkv.stride, rows, d: self.d, norm, rope: rope.map(|t| (t, row)), rotation }
+        HeadRows {
+            x,
+            stride: qkv.stride,
+            rows,
+            d: self.d,
+            norm,
+            rope: rope.map(|table| Turn { table, first: row, step: 1 }),
+            rotation,
+        }
     }
 
     /// Packs keys and values of a frame and head into its part of the scratch.
@@ -443,25 +452,19 @@ impl<'a> Job<'a> {
         start: &[[i32; LANES]; PANELS],
         out: &mut [i32],
     ) {
-        let kernel = self.kernels.gemm_s8;
-        let (steps, nv) = (self.d / QUAD, kernel.nr / NR);
+        let (steps, nv) = (self.d / QUAD, self.kernels.gemm_s8.nr / NR);
         for p in (0..panels).step_by(nv) {
-            let here = nv.min(panels - p);
-            let start = group(start, p);
-            for r in (0..keys).step_by(kernel.mr) {
-                let rows = kernel.fit(kernel.mr.min(keys - r));
-                self.kernels.tile_s8(TileS8 {
-                    rows,
-                    panels: here,
-                    steps,
-                    a: &unit.k[(first + r) * steps * QUAD..][..rows * steps * QUAD],
-                    w: &q[p * steps * STEP..],
-                    w_stride: steps * STEP,
-                    start: Some(&start),
-                    acc: &mut out[(p * SCORE_ROWS + r) * NR..],
-                    acc_stride: SCORE_ROWS * NR,
-                });
-            }
+            self.kernels.column_s8(ColumnS8 {
+                rows: keys,
+                panels: nv.min(panels - p),
+                steps,
+                a: &unit.k[first * steps * QUAD..],
+                w: &q[p * steps * STEP..],
+                w_stride: steps * STEP,
+                start: &group(start, p),
+                acc: &mut out[p * SCORE_ROWS * NR..],
+                acc_stride: SCORE_ROWS * NR,
+            });
         }
     }
 
@@ -475,26 +478,20 @@ impl<'a> Job<'a> {
         out: &mut [i32],
     ) {
         let kernel = self.kernels.gemm_s8;
-        let (d, steps, nv) = (self.d, keys.div_ceil(QUAD), kernel.nr / NR);
-        let tile = &unit.v[first / KEYS * value_tile_len(kernel, d) * QUAD..];
+        let (d, nv) = (self.d, kernel.nr / NR);
         let start: [[i32; LANES]; PANELS] = std::array::from_fn(|p| self.starts(&weight_sums[p]));
         for p in (0..panels).step_by(nv) {
-            let here = nv.min(panels - p);
-            let start = group(&start, p);
-            for r in (0..d).step_by(kernel.mr) {
-                let rows = kernel.fit(kernel.mr.min(d - r));
-                self.kernels.tile_s8(TileS8 {
-                    rows,
-                    panels: here,
-                    steps,
-                    a: &tile[r * steps * QUAD..][..rows * steps * QUAD],
-                    w: &weights[p * KEYS * NR..],
-                    w_stride: KEYS * NR,
-                    start: Some(&start),
-                    acc: &mut out[(p * (d + MAX_MR) + r) * NR..],
-                    acc_stride: (d + MAX_MR) * NR,
-                });
-            }
+            self.kernels.column_s8(ColumnS8 {
+                rows: d,
+                panels: nv.min(panels - p),
+                steps: keys.div_ceil(QUAD),
+                a: &unit.v[first / KEYS * value_tile_len(kernel, d) * QUAD..],
+                w: &weights[p * KEYS * NR..],
+                w_stride: KEYS * NR,
+                start: &group(&start, p),
+                acc: &mut out[p * (d + MAX_MR) * NR..],
+                acc_stride: (d + MAX_MR) * NR,
+            });
         }
     }
 }
@@ -613,6 +610,7 @@ mod tests {
         bytes: 1,
         run: gemm_s8,
         windows: conv_s8,
+        column: column_s8,
         peak: peak_s8,
     };
 

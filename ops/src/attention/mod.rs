@@ -141,7 +141,11 @@ impl Job<'_> {
             let (k, v) = (&k[unit * room.k..][..room.k], &v[unit * room.v..][..room.v]);
             for t in (0..tokens).step_by(KEYS) {
                 let keys = KEYS.min(tokens - t);
-                scores.fill(0.0);
+                // What the tiles of these keys write, and no more.
+                for p in 0..QUERIES / NR {
+                    let rows = keys.next_multiple_of(kernel.mr);
+                    scores[p * score_rows * NR..][..rows * NR].fill(0.0);
+                }
                 for p in (0..QUERIES / NR).step_by(nv) {
                     for r in (0..keys).step_by(kernel.mr) {
                         let rows = kernel.fit(kernel.mr.min(keys - r));

@@ -79,16 +79,21 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn store_low_bytes(v: [Self; 4], x: &mut [i8; 4 * LANES]);
 }
 
-/// Sum of the lanes in the one fixed order: l + (l+8), then +4, +2, +1.
+/// Sum of the lanes in the one fixed order, l + (l+8), then +4, +2, +1, in every lane: addition commutes, so that the lanes'
+/// partners fold alike.
+#[inline(always)]
+pub(crate) fn fold_lanes<V: Vector>(v: V) -> V {
+    let v = v + v.swap::<8>();
+    let v = v + v.swap::<4>();
+    let v = v + v.swap::<2>();
+    v + v.swap::<1>()
+}
+
+/// [`fold_lanes`] as a number.
 #[inline(always)]
 pub(crate) fn fold_add<V: Vector>(v: V) -> f32 {
     let mut x = [0.0f32; LANES];
-    v.store(&mut x);
-    for half in [8, 4, 2, 1] {
-        for l in 0..half {
-            x[l] += x[l + half];
-        }
-    }
+    fold_lanes(v).store(&mut x);
     x[0]
 }
 

@@ -2,7 +2,7 @@
 #![allow(unsafe_code)]
 
 use super::scalar;
-use super::tile::{FinishS8, QuadPack, TileS8, WidePack};
+use super::tile::{ColumnS8, FinishS8, QuadPack, TileS8, WidePack};
 #[cfg(target_arch = "x86_64")]
 use super::{avx2, avx2wide, avx512vnni, avxvnni};
 #[cfg(target_arch = "aarch64")]
@@ -40,6 +40,8 @@ pub struct GemmS8Kernel {
     pub(crate) run: unsafe fn(TileS8, ()),
     /// The tile on windows in place.
     pub(crate) windows: unsafe fn(TileS8, Windows),
+    /// Tiles of packed rows below one another.
+    pub(crate) column: unsafe fn(ColumnS8),
     pub(crate) peak: unsafe fn(i32) -> i32,
 }
 
@@ -72,6 +74,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 1,
         run: avx512vnni::gemm_s8,
         windows: avx512vnni::conv_s8,
+        column: avx512vnni::column_s8,
         peak: avx512vnni::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -85,6 +88,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 1,
         run: avxvnni::gemm_s8,
         windows: avxvnni::conv_s8,
+        column: avxvnni::column_s8,
         peak: avxvnni::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -98,6 +102,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 2,
         run: avx2wide::gemm_s8,
         windows: avx2wide::conv_s8,
+        column: avx2wide::column_s8,
         peak: avx2wide::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -111,6 +116,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 1,
         run: avx2::gemm_s8,
         windows: avx2::conv_s8,
+        column: avx2::column_s8,
         peak: avx2::peak_s8,
     },
     #[cfg(target_arch = "aarch64")]
@@ -124,6 +130,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 1,
         run: neondot::gemm_s8,
         windows: neondot::conv_s8,
+        column: neondot::column_s8,
         peak: neondot::peak_s8,
     },
     #[cfg(target_arch = "aarch64")]
@@ -137,6 +144,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 1,
         run: neon::gemm_s8,
         windows: neon::conv_s8,
+        column: neon::column_s8,
         peak: neon::peak_s8,
     },
     GemmS8Kernel {
@@ -149,6 +157,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         bytes: 1,
         run: scalar::gemm_s8,
         windows: scalar::conv_s8,
+        column: scalar::column_s8,
         peak: scalar::peak_s8,
     },
 ];
@@ -188,6 +197,13 @@ impl Kernels {
     pub(crate) fn peak_s8(&self, seed: i32) -> i32 {
         // SAFETY: chosen under the detected features.
         unsafe { (self.product_s8.peak)(seed) }
+    }
+
+    /// Runs the tiles of all rows that share some panels, with the kernel that takes activations as bytes.
+    #[inline]
+    pub(crate) fn column_s8(&self, column: ColumnS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.gemm_s8.column)(column) }
     }
 
     #[inline]

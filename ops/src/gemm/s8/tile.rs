@@ -83,6 +83,47 @@ pub(crate) struct TileS8<'a> {
     pub acc_stride: usize,
 }
 
+/// Tiles below one another: one call for all packed rows that share some panels.
+pub(crate) struct ColumnS8<'a> {
+    /// Rows.
+    pub rows: usize,
+    /// Panels, up to the kernel's nr / 16.
+    pub panels: usize,
+    /// Steps of four inputs.
+    pub steps: usize,
+    /// Full tiles and a last one of fewer rows, each `[step][rows of the tile][4]`: the bytes of the kernel's values.
+    pub a: &'a [i8],
+    /// First panel at its first step.
+    pub w: &'a [i8],
+    /// Bytes from one panel to the next.
+    pub w_stride: usize,
+    /// Where every row's sums start, per panel.
+    pub start: &'a [[i32; LANES]; MAX_NV],
+    /// `[panel][row][16]`.
+    pub acc: &'a mut [i32],
+    /// Values from one panel's sums to the next.
+    pub acc_stride: usize,
+}
+
+impl ColumnS8<'_> {
+    /// The tile of so many rows from a row on, values of so many bytes.
+    #[inline(always)]
+    pub(crate) fn tile(&mut self, first: usize, rows: usize, bytes: usize) -> TileS8<'_> {
+        let row = self.steps * QUAD * bytes;
+        TileS8 {
+            rows,
+            panels: self.panels,
+            steps: self.steps,
+            a: &self.a[first * row..][..rows * row],
+            w: self.w,
+            w_stride: self.w_stride,
+            start: Some(self.start),
+            acc: &mut self.acc[first * LANES..],
+            acc_stride: self.acc_stride,
+        }
+    }
+}
+
 /// Sums of a tile in registers: from `start`, or from where the last block left them.
 #[inline(always)]
 fn begin<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, t: &TileS8) -> [[D::Acc; NV]; MR] {
@@ -202,11 +243,12 @@ pub(crate) fn peak_body<D: Dot8, const MR: usize, const NV: usize>(d: D, seed: i
     sums.as_flattened().as_flattened().iter().fold(0, |x, y| x ^ y)
 }
 
-/// `gemm_s8`, `conv_s8` and `peak_s8` of one instruction set: one body per row count and panel count.
+/// `gemm_s8`, `conv_s8`, `column_s8` and `peak_s8` of one instruction set: one body per row count and panel count.
 macro_rules! gemm_s8_entries {
     ($token:ident, rows $rows:tt, panels $panels:tt, full $mr:literal x $nv:literal $(, $features:literal)?) => {
         crate::gemm::s8::tile::s8_entry!(gemm_s8, packed, (), $token, $rows, $panels $(, $features)?);
         crate::gemm::s8::tile::s8_entry!(conv_s8, windows, crate::gemm::tile::Windows, $token, $rows, $panels $(, $features)?);
+        crate::gemm::s8::tile::s8_column!($token, $rows, $panels, $mr $(, $features)?);
 
         /// Peak probe.
         $(#[target_feature(enable = $features)])?
@@ -230,6 +272,32 @@ macro_rules! s8_entry {
     };
 }
 pub(crate) use s8_entry;
+
+macro_rules! s8_column {
+    ($token:ident, $rows:tt, [$($panels:literal),*], $mr:literal $(, $features:literal)?) => {
+        /// Tiles of packed rows below one another.
+        $(#[target_feature(enable = $features)])?
+        pub(crate) fn column_s8(mut t: crate::gemm::s8::tile::ColumnS8) {
+            let bytes = size_of::<<$token as crate::gemm::s8::tile::Dot8>::Elem>();
+            let full = t.rows - t.rows % $mr;
+            match t.panels {
+                $($panels => {
+                    for first in (0..full).step_by($mr) {
+                        let tile = t.tile(first, $mr, bytes);
+                        crate::gemm::s8::tile::packed::<_, $mr, $panels>($token::new(), tile, ());
+                    }
+                })*
+                other => panic!("tiles of {other} panels"),
+            }
+            if full < t.rows {
+                let left = t.rows - full;
+                let rows = *$rows.iter().find(|r| **r >= left).expect("at most the full rows");
+                gemm_s8(t.tile(full, rows, bytes), ());
+            }
+        }
+    };
+}
+pub(crate) use s8_column;
 
 macro_rules! s8_by_rows {
     ($body:ident, $arguments:tt, $panels:literal, $count:expr, [$($rows:literal),*]) => {
