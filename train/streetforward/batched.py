@@ -30,11 +30,22 @@ class Raw:
 
     translation: torch.Tensor  # [B, F, 3]
     rotation: torch.Tensor  # [B, F, 3, 3]
-    fov: torch.Tensor  # [B, F, 2], ln of the focal lengths over the image's sides
+    fov: torch.Tensor | None  # [B, F, 2], ln of the focal lengths over the image's sides
     depth: torch.Tensor | None = None
+    conf: torch.Tensor | None = None  # of the frames of `depth`, where the network has such a head
     gs: torch.Tensor | None = None
     motion: dict = field(default_factory=dict)
     kept: list = field(default_factory=list)  # (name, queries, keys) [B, F, P, d] of attention heads under supervision
+
+    def log_depth(self, config):
+        """[rows, H, W]"""
+        return self.depth[..., 0 if config["depth.out_map"] == "exp_z_conf" else -1]
+
+    def solid(self, config):
+        """Logit that a pixel is not sky [rows, H, W], or None."""
+        if config["depth.out_map"] == "exp_z_conf":
+            return self.depth[..., 1]
+        return None if self.conf is None else self.conf[..., 0]
 
 
 class Nearest(torch.autograd.Function):
@@ -79,6 +90,11 @@ def rotations(nine):
     return Nearest.apply(m / m.norm(dim=-1, keepdim=True).clamp_min(1e-12))
 
 
+def full(x):
+    """What autocast left in bf16 as f32."""
+    return x.float() if x.dtype == torch.bfloat16 else x
+
+
 def forward_clips(model, images, times, wanted, keep=()):
     """images [B, F, H, W, 3] in 0..1, times f64 [B, F].
 
@@ -108,7 +124,7 @@ def forward_clips(model, images, times, wanted, keep=()):
     features = last_features(layers, config["head.concat"])
     camera = model.camera_decoder(features, grid, registers, config)
     with torch.autocast(images.device.type, enabled=False):
-        translation, nine, fov = model.camera_head(camera.float())
+        translation, nine, fov = model.camera_head(full(camera))
     raw = Raw(
         translation.unflatten(0, (batch, frames)),
         rotations(nine.unflatten(0, (batch, frames))),
@@ -117,21 +133,28 @@ def forward_clips(model, images, times, wanted, keep=()):
 
     guide = model.image_stem(normal) if hasattr(model, "image_stem") else None
 
-    def dense(name, prefix, tokens, rows, registers):
-        tokens = getattr(model, f"{name}_decoder")(tokens, grid, registers, config)
+    def dense(name, prefix, layers, rows, registers):
         head = getattr(model, f"{name}_head")
+        taps = config[f"{prefix}.taps"]
+        if config[f"{prefix}.kind"] == "dpt":
+            if prefix != "motion":  # pairs of a frame and a global layer
+                layers = [torch.cat(layers[2 * j : 2 * j + 2], dim=-1) if j in taps else None for j in range(len(layers) // 2)]
+            return full(head([layers[j][rows, registers:] for j in taps], grid, config["patch"]))
+        tokens = layers[-1] if prefix == "motion" else last_features(layers, config["head.concat"])
+        tokens = getattr(model, f"{name}_decoder")(tokens[rows], grid, registers, config)
         if config[f"{prefix}.kind"] == "guided":
-            return head(tokens, grid, guide[rows]).float()
-        return head(tokens, grid).float()
+            return full(head(tokens, grid, guide[rows]))
+        return full(head(tokens, grid))
 
     if wanted.depth is not None:
-        raw.depth = dense("point", "depth", features[wanted.depth], wanted.depth, registers)
+        raw.depth = dense("point", "depth", layers, wanted.depth, registers)
+        if config["conf.kind"] != "none":
+            raw.conf = dense("conf", "conf", layers, wanted.depth, registers)
     if wanted.gs is not None:
-        raw.gs = dense("gs", "gs", features[wanted.gs], wanted.gs, registers)
+        raw.gs = dense("gs", "gs", layers, wanted.gs, registers)
     if wanted.motion is not None:
-        for way, tokens in causal_clips(model, layers, time, batch, frames, grid, raw.kept).items():
-            rows = wanted.motion[way]
-            raw.motion[way] = dense("motion", "motion", tokens[rows], rows, 0)
+        for way, outputs in causal_clips(model, layers, time, batch, frames, grid, raw.kept).items():
+            raw.motion[way] = dense("motion", "motion", outputs, wanted.motion[way], 0)
     for name in keep:
         attention = model.get_submodule(name).attn
         attention.keep = False
@@ -142,7 +165,7 @@ def forward_clips(model, images, times, wanted, keep=()):
 
 
 def alternate_clips(model, tokens, batch, frames, grid):
-    """Tokens [B F, T, C] through the alternating stack; the outputs of its last two layers."""
+    """Tokens [B F, T, C] through the alternating stack; every layer's output."""
     config = model.config
     positions = patch_positions(*grid, config["aa.registers"]).to(tokens.device)
     head_dim = config["aa.dim"] // config["aa.heads"]
@@ -155,11 +178,11 @@ def alternate_clips(model, tokens, batch, frames, grid):
         else:
             x = block(x, inside)
         outputs.append(x)
-    return outputs[-2:]
+    return outputs
 
 
 def causal_clips(model, layers, time, batch, frames, grid, kept):
-    """Patch tokens [B F, P, D'] after the last causal layer of each pass."""
+    """Patch tokens [B F, P, D'] after every causal layer of each pass."""
     config = model.config
     if config["causal.registers"] or config["motion.layout"] != "per_direction":
         raise ValueError("training in batches needs causal.registers = false and motion.layout = per_direction")
@@ -173,11 +196,11 @@ def causal_clips(model, layers, time, batch, frames, grid, kept):
         blocks = model.causal_back if way == "bwd" and not config["causal.share"] else model.causal
         mask = frame_mask(frames, *reach).to(tokens.device)
         mask = mask.repeat_interleave(length, 0).repeat_interleave(length, 1)
-        x = tokens.reshape(batch, frames * length, dim)
+        x, result[way] = tokens.reshape(batch, frames * length, dim), []
         for i, block in enumerate(blocks):
             x = block(x, rope, mask)
             if block.attn.keep:
                 q, k = (t.unflatten(1, (frames, length)) for t in block.attn.kept)
                 kept.append((f"causal.{way}.{i}", q, k))
-        result[way] = x.reshape(batch * frames, length, dim)
+            result[way].append(x.reshape(batch * frames, length, dim))
     return result

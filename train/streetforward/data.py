@@ -1,6 +1,6 @@
 """Clips for training: streamed from the generator in Rust, cached as files, sampled by number, augmented.
 
-A chunk file is 256 records of the generator's binary stream (`synth/src/stream.rs`), all of one size, so that it maps
+A chunk file is (by default) 256 records of the generator's binary stream (`synth/src/stream.rs`), all of one size, so that it maps
 into memory as one structured array. Chunk i holds the split's clips with seeds from 4096 i on: the same bytes anywhere.
 """
 
@@ -46,10 +46,13 @@ def record_dtype(frames, height, width):
 class Chunks:
     """Chunk files of one split and size in a folder, made on demand by the generator."""
 
-    def __init__(self, generator, folder, split, width, height, frames=4, threads=1):
+    def __init__(self, generator, folder, split, width, height, frames=4, stride=None, count=CHUNK, threads=1):
         self.generator, self.split, self.size, self.threads = Path(generator), split, (width, height), threads
+        self.count = count  # clips of a chunk
+        self.timing = [] if stride is None else [frames, stride]  # without a stride each seed has its own
         self.dtype = record_dtype(frames, height, width)
-        self.folder = Path(folder) / f"{split}-{width}x{height}"
+        timing = "".join(f"-{n}" for n in self.timing) + (f"-by{count}" if count != CHUNK else "")
+        self.folder = Path(folder) / f"{split}-{width}x{height}{timing}"
         self.folder.mkdir(parents=True, exist_ok=True)
         self.maps, self.lock, self.making = {}, threading.Lock(), threading.Lock()
 
@@ -66,13 +69,13 @@ class Chunks:
         if path.exists():
             return
         partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-        command = [self.generator, self.split, i * SEED_STRIDE, CHUNK, f"{self.size[0]}x{self.size[1]}"]
+        command = [self.generator, self.split, i * SEED_STRIDE, self.count, f"{self.size[0]}x{self.size[1]}", *self.timing]
         environment = os.environ | {"RAYON_NUM_THREADS": str(self.threads)}
         with open(partial, "wb") as out:
             done = subprocess.run(
                 [str(c) for c in command], stdout=out, stderr=subprocess.PIPE, env=environment, check=False
             )
-        expected = CHUNK * self.dtype.itemsize
+        expected = self.count * self.dtype.itemsize
         if done.returncode or partial.stat().st_size != expected:
             size = partial.stat().st_size
             partial.unlink()
@@ -95,7 +98,7 @@ class Chunks:
             return self.maps[i]
 
     def clip(self, number, wait=False):
-        return self.chunk(number // CHUNK, wait)[number % CHUNK]
+        return self.chunk(number // self.count, wait)[number % self.count]
 
 
 @dataclass
@@ -109,15 +112,17 @@ class Sampler:
     seed: int
     window: int = 1024
     reuse: float = 3.0
+    offset: int = 0  # number of the first clip: another offset, other streets
 
     def draw(self, s):
         """Number of the clip and the generator of its augmentation."""
         rng = np.random.Generator(np.random.PCG64([self.seed, s]))
-        first = int(s / self.reuse)
+        first = self.offset + int(s / self.reuse)
         return first + int(rng.integers(self.window)), rng
 
-    def last_chunk(self, s):
-        return (int(s / self.reuse) + self.window - 1) // CHUNK
+    def last(self, s):
+        """Largest number that sample s may draw."""
+        return self.offset + int(s / self.reuse) + self.window - 1
 
 
 @dataclass
@@ -130,6 +135,10 @@ class Batch:
     velocity: torch.Tensor  # f32 [B, F, H, W, 3], axes of each frame's camera, m/s
     pose: torch.Tensor  # f64 [B, F, 4, 4], camera to world
     focal: torch.Tensor  # f64 [B, 2], pixels
+
+    def frames(self, chosen):
+        """The clips with these frames alone."""
+        return Batch(*(v if name == "focal" else v[:, chosen] for name, v in vars(self).items()))
 
     def to(self, device):
         return Batch(*(value.to(device, non_blocking=True) for value in vars(self).values()))
@@ -192,11 +201,11 @@ class Loader:
             s += self.batch
 
     def make_ahead(self, start):
-        made = self.sampler.last_chunk(start)
+        made = self.sampler.last(start)  # earlier ones are made where they are read
         while True:
-            if made <= self.sampler.last_chunk(self.front) + 1:
-                self.chunks.make(made)
-                made += 1
+            if made <= self.sampler.last(self.front) + self.chunks.count:
+                self.chunks.make(made // self.chunks.count)
+                made += self.chunks.count
             else:
                 time.sleep(1)
 

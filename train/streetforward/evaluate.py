@@ -13,6 +13,7 @@ import torch
 from . import config as cfg
 from .batched import Wanted, forward_clips
 from .data import Chunks, collate, held_out, read_clip
+from .gaussians import fit_focal
 from .losses import DYNAMIC, NEAR, relative
 
 
@@ -26,9 +27,15 @@ def predict(model, batch):
         motion = {"fwd": rows[:, :-1].flatten(), "bwd": rows[:, 1:].flatten()}
     raw = forward_clips(model, batch.images, batch.times, Wanted(depth=rows.flatten(), motion=motion))
     shape = batch.depth.shape
-    out = {"depth": raw.depth[..., 0].exp().view(shape), "solid": raw.depth[..., 1].view(shape)}
+    out = {"depth": raw.log_depth(config).exp().view(shape)}
+    solid = raw.solid(config)
+    out["solid"] = torch.ones_like(out["depth"]) if solid is None else solid.view(shape)
     out["turn"], out["shift"] = (m[:, 0] for m in relative(raw.rotation, raw.translation.double()))
     out["fov"] = raw.fov
+    if raw.fov is None:
+        points = points_of(raw.depth, config).unflatten(0, (b, f))
+        sides = torch.tensor([shape[3], shape[2]], device=points.device)
+        out["fov"] = torch.stack([(fit_focal(p, config["camera.k"] == "fit_shared") / sides).log() for p in points])
     if motion is not None:
         ahead = raw.motion["fwd"].view(b, f - 1, *shape[2:], 4)
         behind = raw.motion["bwd"].view(b, f - 1, *shape[2:], 4)
@@ -39,6 +46,12 @@ def predict(model, batch):
         middle = (p[:, 1:] + q[:, :-1]) / 2
         out["dynamic"] = torch.cat((p[:, :1], middle, q[:, -1:]), dim=1)
     return out
+
+
+def points_of(raw, config):
+    """Local points [..., 3] of a head's (a, b, l) channels."""
+    z = raw[..., -1:].exp()
+    return torch.cat((raw[..., :2] * z, z), dim=-1)
 
 
 class Sums:

@@ -14,7 +14,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from . import config as cfg
 from .golden import CASES
-from .weights import golden_model, training_start
+from .weights import golden_model, read_model, training_start, write_model
 
 # Largest difference, relative to the largest value of a stage, that plain f32 arithmetic may show against f64. A case
 # above it would be too badly conditioned to judge another implementation at 1e-4.
@@ -92,6 +92,12 @@ def export_checkpoint(args):
     print(f"{args.output}: {len(tensors)} tensors, {sum(p.numel() for p in tensors.values())} parameters")
 
 
+def export_shrunk(args):
+    model = read_model(args.model)
+    write_model(args.output, model, {"f16": torch.float16, "f32": torch.float32}[args.dtype])
+    print(f"{args.output}: {args.output.stat().st_size} bytes")
+
+
 def main(argv=None):
     parser = argparse.ArgumentParser(prog="streetforward.export", description=__doc__.splitlines()[0])
     verbs = parser.add_subparsers(required=True)
@@ -105,6 +111,11 @@ def main(argv=None):
     checkpoint.add_argument("--seed", type=int, default=1)
     checkpoint.add_argument("-o", "--output", type=Path, required=True)
     checkpoint.set_defaults(run=export_checkpoint)
+    shrink = verbs.add_parser("shrink", help="rewrite a trained checkpoint in another precision")
+    shrink.add_argument("model", type=Path)
+    shrink.add_argument("--dtype", default="f16", choices=["f16", "f32"])
+    shrink.add_argument("-o", "--output", type=Path, required=True)
+    shrink.set_defaults(run=export_shrunk)
     args = parser.parse_args(argv)
     args.run(args)
 

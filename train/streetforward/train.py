@@ -6,20 +6,19 @@ Resumes by itself when RUN holds a checkpoint. `docs/training.md` walks through 
 """
 
 import argparse
-import json
 import math
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import torch
 
 from . import config as cfg
+from . import ranks
 from .batched import Wanted, forward_clips
-from .data import Chunks, Loader, Sampler, held_out
+from .calibrate import calibrate_camera
+from .data import Chunks, Loader, Sampler, collate, held_out, read_clip
 from .evaluate import evaluate, picture
+from .journal import note, resume, save
 from .losses import (
     camera_losses,
     focal_loss,
@@ -27,7 +26,6 @@ from .losses import (
     matching_loss,
     motion_losses,
     patch_matches,
-    relative,
     sky_loss,
 )
 from .optim import Optimizer
@@ -40,7 +38,7 @@ WEIGHTS = {
     "depth": 1.0,
     "slope": 0.5,
     "sky": 0.2,
-    "rotation": 1.5,
+    "rotation": 5.0,
     "translation": 0.4,
     "focal": 2.0,
     "velocity": 0.2,  # per pass, summed over the three axes
@@ -81,10 +79,12 @@ def step_losses(model, batch, fraction, args, generator):
     depth = batch.depth.flatten(0, 1)
     truth = depth[wanted.depth]
     loss = {}
-    loss["depth"], loss["slope"] = log_depth_loss(raw.depth[..., 0], truth)
-    loss["sky"] = sky_loss(raw.depth[..., 1], truth)
+    loss["depth"], loss["slope"] = log_depth_loss(raw.log_depth(config), truth)
+    if raw.solid(config) is not None:
+        loss["sky"] = sky_loss(raw.solid(config), truth)
     loss["rotation"], loss["translation"] = camera_losses(raw.rotation, raw.translation, batch.pose)
-    loss["focal"] = focal_loss(raw.fov, batch.focal, (width, height))
+    if raw.fov is not None:
+        loss["focal"] = focal_loss(raw.fov, batch.focal, (width, height))
     if moving:
         velocity = batch.velocity.flatten(0, 1)
         loss["velocity"] = loss["dynamic"] = 0
@@ -113,13 +113,17 @@ def step_losses(model, batch, fraction, args, generator):
 class Run:
     """One training process: model, optimiser, data, log and checkpoint."""
 
-    def __init__(self, args):
-        self.args = args
+    def __init__(self, args, reduce=None):
+        self.args, self.reduce = args, reduce
         self.device = torch.device(args.device)
         width, height = (int(n) for n in args.size.split("x"))
         config = cfg.preset(args.preset)
         self.model = scratch_start(config, args.seed).to(self.device)
-        self.model.train()
+        self.chunks = Chunks(args.generator, args.cache, "train", width, height)
+        if args.calibrate and not (args.out / "resume.pt").exists():
+            clips = [read_clip(self.chunks.clip(i, wait=args.rank > 0)) for i in range(args.calibrate)]
+            batches = [collate(clips[i : i + 4]).to(self.device) for i in range(0, len(clips), 4)]
+            note(args, event="calibrate", **calibrate_camera(self.model, batches))
         self.optimizer = Optimizer(
             self.model,
             lambda name: not name.startswith("gs_"),
@@ -128,34 +132,10 @@ class Run:
             ema=args.ema,
         )
         self.samples, self.elapsed = 0, 0.0
-        self.reduce = None
-        if args.ranks > 1:
-            self.reduce = torch.distributed.all_reduce
-        checkpoint = args.out / "resume.pt"
-        if checkpoint.exists():
-            state = torch.load(checkpoint, weights_only=True)
-            self.optimizer.load(state["optimizer"])
-            self.samples, self.elapsed = state["samples"], state["elapsed"]
-            self.log(event="resume", samples=self.samples, elapsed=self.elapsed)
-        sampler = Sampler(args.seed, args.window, args.reuse)
-        self.chunks = Chunks(args.generator, args.cache, "train", width, height)
+        resume(self)
+        sampler = Sampler(args.seed, args.window, args.reuse, args.first_clip)
         self.loader = Loader(self.chunks, sampler, args.batch, self.samples, args.rank, args.ranks)
         self.records = held_out(Chunks(args.generator, args.cache, "held-out", width, height), args.eval_clips)
-
-    def log(self, **entry):
-        if self.args.rank == 0:
-            entry = {"at": time.strftime("%H:%M:%S"), **entry}
-            text = json.dumps({k: round(v, 5) if isinstance(v, float) else v for k, v in entry.items()})
-            with open(self.args.out / "log.jsonl", "a") as file:
-                file.write(text + "\n")
-            print(text, flush=True)
-
-    def save(self):
-        if self.args.rank == 0:
-            path = self.args.out / "resume.pt"
-            state = {"optimizer": self.optimizer.state(), "samples": self.samples, "elapsed": self.elapsed}
-            torch.save(state, path.with_suffix(".partial"))
-            path.with_suffix(".partial").replace(path)
 
     def evaluate(self):
         began = time.time()
@@ -167,21 +147,21 @@ class Run:
             picture(self.model, self.records[:4], self.args.out / f"sheet-{self.samples:07}.png", self.device)
             write_model(self.args.out / "ema.safetensors", self.model)
         self.optimizer.swap()
-        self.log(event="eval", samples=self.samples, elapsed=self.elapsed, seconds=time.time() - began, **entry)
+        note(self.args, event="eval", samples=self.samples, elapsed=self.elapsed, seconds=time.time() - began, **entry)
 
     def train(self):
         args, budget = self.args, 60 * self.args.minutes
         began, mean, last_eval, last_save = time.time() - self.elapsed, {}, self.elapsed, self.elapsed
         count, log_start, log_samples = 0, time.time(), self.samples
-        clock = torch.zeros(1, dtype=torch.float64)
+        clock, stop = torch.zeros(2, dtype=torch.float64), args.out / "stop"
         while True:
             # Rank 0's clock decides for all.
-            clock[0] = time.time() - began
+            clock[0], clock[1] = time.time() - began, stop.exists()
             if args.ranks > 1:
                 torch.distributed.broadcast(clock, 0)
-            self.elapsed = now = clock.item()
+            self.elapsed = now = clock[0].item()
             fraction = now / budget
-            if fraction >= 1 or (args.steps and self.optimizer.steps >= args.steps):
+            if fraction >= 1 or clock[1] or (args.steps and self.optimizer.steps >= args.steps):
                 break
             batch = self.loader.next().to(self.device)
             generator = torch.Generator().manual_seed((args.seed << 40) + (self.samples << 3) + args.rank)
@@ -199,22 +179,22 @@ class Run:
             if count % args.log_every == 0:
                 rate = (self.samples - log_samples) / (time.time() - log_start)
                 means = {name: a / n for name, (a, n) in mean.items()}
-                self.log(step=self.optimizer.steps, samples=self.samples, elapsed=now, lr=scale, rate=rate, **means)
+                note(self.args, step=self.optimizer.steps, samples=self.samples, elapsed=now, lr=scale, rate=rate, **means)
                 mean, log_start, log_samples = {}, time.time(), self.samples
             if now - last_save > 60 * args.save_minutes:
-                self.save()
+                save(self)
                 last_save = now
             if now - last_eval > 60 * args.eval_minutes:
                 self.evaluate()
                 last_eval = now
                 log_start, log_samples = time.time(), self.samples
-        self.save()
+        save(self)
         self.evaluate()
 
 
 def parser():
     p = argparse.ArgumentParser(prog="streetforward.train", description=__doc__.splitlines()[0])
-    p.add_argument("--out", type=Path, required=True, help="folder of the run: log, sheets, checkpoint")
+    p.add_argument("--out", type=Path, required=True, help="folder of the run: log, sheets, checkpoint; a file `stop` in it ends the run")
     p.add_argument("--cache", type=Path, required=True, help="folder for generated clips")
     p.add_argument("--generator", type=Path, required=True, help="the clip generator's `stream` example")
     p.add_argument("--preset", default="nano")
@@ -223,9 +203,7 @@ def parser():
     p.add_argument("--minutes", type=float, default=100, help="training time of the whole schedule, resumptions added up")
     p.add_argument("--steps", type=int, default=0, help="stop after this many steps; 0: only time counts")
     p.add_argument("--batch", type=int, default=4)
-    p.add_argument("--ranks", type=int, default=1, help="processes that share a batch and average gradients")
-    p.add_argument("--rank", type=int, default=0, help=argparse.SUPPRESS)
-    p.add_argument("--threads", type=int, default=1, help="threads of each process")
+    ranks.add_arguments(p)
     p.add_argument("--device", default="cpu")
     p.add_argument("--bf16", action="store_true", help="bf16 autocast; needs bf16 units to be faster")
     p.add_argument("--lr", type=float, default=1e-3)
@@ -233,6 +211,8 @@ def parser():
     p.add_argument("--ema", type=float, default=0.999)
     p.add_argument("--window", type=int, default=1024)
     p.add_argument("--reuse", type=float, default=3.0)
+    p.add_argument("--first-clip", type=int, default=0, help="number of the first clip; another one, other streets")
+    p.add_argument("--calibrate", type=int, default=0, help="clips that set the camera head's start (calibrate.py)")
     p.add_argument("--motion-from", type=float, default=0.3, help="part of the schedule without motion")
     p.add_argument("--depth-frames", type=int, default=2, help="frames of a clip whose depth is computed")
     p.add_argument("--motion-frames", type=int, default=2, help="frames of a clip and pass whose motion is computed")
@@ -247,25 +227,7 @@ def parser():
 def main(argv=None):
     args = parser().parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    torch.set_num_threads(args.threads)
-    others = []
-    if args.ranks > 1:
-        os.environ.setdefault("MASTER_ADDR", "127.0.0.1")
-        os.environ.setdefault("MASTER_PORT", "29511")
-        if args.rank == 0:
-            given = list(sys.argv[1:] if argv is None else argv)
-            for rank in range(1, args.ranks):
-                command = [sys.executable, "-m", "streetforward.train", *given, "--rank", str(rank)]
-                others.append(subprocess.Popen(command))
-        torch.distributed.init_process_group("gloo", rank=args.rank, world_size=args.ranks)
-    try:
-        Run(args).train()
-    except BaseException:
-        for process in others:
-            process.terminate()
-        raise
-    for process in others:
-        process.wait()
+    ranks.run("streetforward.train", args, argv, lambda reduce: Run(args, reduce).train())
 
 
 if __name__ == "__main__":

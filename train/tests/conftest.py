@@ -37,3 +37,11 @@ def run():
         return stages
 
     return run
+
+
+@pytest.fixture
+def generator(tmp_path):
+    """A stand-in for the clip generator: random pictures in its layout."""
+    from stand_in import write_generator
+
+    return write_generator(tmp_path)
