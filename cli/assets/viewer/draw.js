@@ -5,6 +5,7 @@ const VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
 precision highp usampler2D;
+precision highp sampler2D;
 layout(location = 0) in vec3 vertex;   // corner, and quad of the instance
 uniform usampler2D order, core, shape, motion;
 uniform sampler2D frames, ramp;
