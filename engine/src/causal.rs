@@ -94,12 +94,15 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
     }
 
     let (fwd, bwd) = Reach::of(config);
-    let passes = [("fwd", Some(fwd), &w.causal), ("bwd", bwd, w.causal_back.as_ref().unwrap_or(&w.causal))];
+    let (ahead, behind) = Reach::directions(config);
+    let back = w.causal_back.as_ref().unwrap_or(&w.causal);
+    let passes = [("fwd", Some((fwd, ahead)), &w.causal), ("bwd", bwd.zip(behind), back)];
     let map_len = d.frames * d.pixels() * config.motion.out as usize;
     for ((name, reach, blocks), raw) in passes.into_iter().zip(job.raw.chunks_exact_mut(map_len)) {
-        let Some(reach) = reach else { continue };
+        let Some((reach, direction)) = reach else { continue };
         x.copy_from_slice(start);
-        let pass = Pass { net, d, tables, guide: job.guide, mask: mask(config, d, reach), blocks, reach, name };
+        let mask = mask(config, d, reach);
+        let pass = Pass { net, d, tables, guide: job.guide, mask, blocks, direction, name };
         let shared = w.causal_back.is_none().then_some(&*shared);
         pass.layers(shared, x, tapped, scratch, probe)?;
         probe.lap("causal");
@@ -109,11 +112,11 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
     Ok(())
 }
 
-/// Whether the map of frame `f` in a pass that reaches this far is read: a direction without a neighbour mirrors the
+/// Whether the map of frame `f` in the pass of this direction is read: a direction without a neighbour mirrors the
 /// other one, where there is another.
-pub(crate) fn is_read(config: &ModelConfig, reach: Reach, f: usize, frames: usize) -> bool {
+pub(crate) fn is_read(config: &ModelConfig, direction: Reach, f: usize, frames: usize) -> bool {
     let mirrored = config.render_extrapolate == Extrapolate::Mirror && Reach::of(config).1.is_some();
-    !mirrored || reach.has_neighbour(f, frames)
+    !mirrored || direction.has_neighbour(f, frames)
 }
 
 /// Features and time embedding side by side.
@@ -149,7 +152,7 @@ struct Pass<'a> {
     guide: &'a [f32],
     mask: FrameMask,
     blocks: &'a [Block],
-    reach: Reach,
+    direction: Reach,
     name: &'static str,
 }
 
@@ -216,7 +219,7 @@ impl Pass<'_> {
         let out = heads::channels(head);
         for (f, map) in raw.chunks_exact_mut(d.pixels() * out).enumerate() {
             // Only a tap wants a map that is never read.
-            if !is_read(self.net.model.config(), self.reach, f, d.frames) && !probe.tapped() {
+            if !is_read(self.net.model.config(), self.direction, f, d.frames) && !probe.tapped() {
                 continue;
             }
             dense.frame(source, f, scratch, map);

@@ -160,8 +160,10 @@ fn rows(c: &ModelConfig, d: &Dims, name: &str) -> (&'static str, usize) {
         }
         "motion_decoder" => ("motion", passes.len() * f * d.patches),
         "motion_head" => {
-            let read = |reach: &Reach| (0..f).filter(|&i| causal::is_read(c, *reach, i, f)).count();
-            ("motion", passes.iter().map(read).sum::<usize>() * head_rows(d, rest))
+            let (ahead, behind) = Reach::directions(c);
+            let directions = [Some(ahead), behind].into_iter().flatten().take(passes.len());
+            let read = |direction: Reach| (0..f).filter(|&i| causal::is_read(c, direction, i, f)).count();
+            ("motion", directions.map(read).sum::<usize>() * head_rows(d, rest))
         }
         _ => {
             let stage = match part.split('_').next() {

@@ -11,6 +11,7 @@ use sf_ops::gemm::{PanelData, Panels, PanelsS8};
 use sf_ops::hadamard::Rotation;
 use sf_ops::simd::LANES;
 use std::path::Path;
+use std::sync::Arc;
 
 /// A matrix in panels, `[n, k]`.
 #[derive(Clone, Copy, Debug)]
@@ -216,7 +217,9 @@ pub(crate) struct Weights {
 /// ```
 #[derive(Debug)]
 pub struct Model {
-    blob: Blob,
+    blob: Arc<Blob>,
+    /// The blob's own, or one with other conventions.
+    config: ModelConfig,
     weights: Weights,
 }
 
@@ -229,14 +232,29 @@ impl Model {
     /// From an opened blob.
     pub fn from_blob(blob: Blob) -> Result<Model> {
         let config = blob.config().clone();
+        Self::new(Arc::new(blob), config)
+    }
+
+    /// The same weights under other conventions (`mask.k`, `render.window`, ...): for ablations and experiments.
+    ///
+    /// # Errors
+    /// `Model` when the configuration is not valid or asks for other tensors.
+    pub fn with_config(&self, config: ModelConfig) -> Result<Model> {
+        if sf_formats::arch::tensors(&config) != sf_formats::arch::tensors(&self.config) {
+            return Err(Error::model("configuration", "asks for other tensors than the model has"));
+        }
+        Self::new(Arc::clone(&self.blob), config)
+    }
+
+    fn new(blob: Arc<Blob>, config: ModelConfig) -> Result<Model> {
         config.check("model")?;
         let weights = Lookup { blob: &blob, config: &config }.weights()?;
-        Ok(Model { blob, weights })
+        Ok(Model { blob, config, weights })
     }
 
     /// Sizes and conventions.
     pub fn config(&self) -> &ModelConfig {
-        self.blob.config()
+        &self.config
     }
 
     /// The file behind it.

@@ -19,7 +19,10 @@ pub(crate) struct Reach {
 impl Reach {
     /// Of the forward and the backward pass; one-pass networks have the first alone, both ways.
     pub(crate) fn of(config: &ModelConfig) -> (Reach, Option<Reach>) {
-        let k = config.mask_k as i32;
+        Self::within(config, config.mask_k as i32)
+    }
+
+    fn within(config: &ModelConfig, k: i32) -> (Reach, Option<Reach>) {
         if config.motion_layout == MotionLayout::SinglePass {
             return (Reach { lo: -k, hi: k }, None);
         }
@@ -29,6 +32,12 @@ impl Reach {
             Orientation::Equation => (ahead, Some(behind)),
             Orientation::Figure => (behind, Some(ahead)),
         }
+    }
+
+    /// The directions themselves, for which frames have a neighbour: as [`Reach::of`], but a mask of no frames
+    /// (an ablation) does not take away what there is to move towards.
+    pub(crate) fn directions(config: &ModelConfig) -> (Reach, Option<Reach>) {
+        Self::within(config, config.mask_k.max(1) as i32)
     }
 
     /// Whether frame `f` of `frames` sees any other frame.
@@ -78,7 +87,7 @@ impl Map {
     /// For frame `f` of a clip with these times; `rotation` takes its camera's axes to the world's.
     pub(crate) fn new(config: &ModelConfig, times: &[f64], f: usize, rotation: [[f32; 3]; 3]) -> Map {
         let n = times.len();
-        let seen = match Reach::of(config) {
+        let seen = match Reach::directions(config) {
             (fwd, Some(bwd)) => (fwd.has_neighbour(f, n), bwd.has_neighbour(f, n)),
             (_, None) => (f + 1 < n, f > 0),
         };
@@ -178,6 +187,11 @@ mod tests {
         assert_eq!(Reach::of(&c), (Reach { lo: -2, hi: -1 }, Some(Reach { lo: 1, hi: 2 })));
         c.motion_layout = MotionLayout::SinglePass;
         assert_eq!(Reach::of(&c), (Reach { lo: -2, hi: 2 }, None));
+        // No neighbour in the mask: the directions stay.
+        let c = ModelConfig { mask_k: 0, ..ModelConfig::base() };
+        let (own, directions) = (Reach { lo: 0, hi: 0 }, Reach::directions(&c));
+        assert_eq!(Reach::of(&c), (own, Some(own)));
+        assert_eq!(directions, Reach::of(&ModelConfig::base()));
         let ahead = Reach { lo: 0, hi: 1 };
         assert!(ahead.has_neighbour(0, 2) && !ahead.has_neighbour(1, 2) && !ahead.has_neighbour(0, 1));
     }

@@ -118,7 +118,10 @@ impl ModelConfig {
         }
         if self.causal_depth > 0 {
             self.heads(at, "causal", self.causal_dim(), self.causal_heads)?;
-            range("mask.k", self.mask_k, 1, 1024)?;
+            range("mask.k", self.mask_k, 0, 1024)?;
+            if self.mask_k == 0 && !self.mask_self {
+                return bad("mask.k = 0 leaves nothing to see: mask.self must be true".into());
+            }
             let want = match self.motion_layout {
                 MotionLayout::PerDirection => 4,
                 MotionLayout::SinglePass => 7,

@@ -232,6 +232,34 @@ fn p16_the_host_control_word_changes_nothing() {
     assert_eq!(plain, other);
 }
 
+/// The ablation without causal attention: no frame sees another, yet every frame has its velocities, and nothing
+/// before the causal module changes.
+#[test]
+fn conventions_change_without_new_weights() {
+    for config in [tiny(), tiny_guided()] {
+        let model = model(&config, &tensors(&config, 17), Dtype::F32);
+        let blind = Arc::new(model.with_config(ModelConfig { mask_k: 0, ..config.clone() }).unwrap());
+        let clip = Frames::new(3, 28, 42, 17);
+        let (seeing, alone) = (stages(&model, &clip.input()), stages(&blind, &clip.input()));
+        assert_eq!(seeing["aa.3"], alone["aa.3"]);
+        assert_ne!(seeing["causal.fwd.0"], alone["causal.fwd.0"]);
+        // Both passes see the same, namely their own frame.
+        assert_eq!(alone["causal.fwd.1"], alone["causal.bwd.1"]);
+        let out = session(&blind, clip.shape).run(&clip.input()).unwrap().clone();
+        assert_eq!(out.neighbours, [(true, false), (true, true), (false, true)]);
+        assert!(out.v_fwd.iter().chain(&out.v_bwd).all(|v| v.iter().any(|x| *x != 0.0)));
+        let weights = streetforward::reference::Weights::from_map(tensors(&config, 17), blind.config()).unwrap();
+        let plain = streetforward::reference::run(&weights, blind.config(), &clip.input()).unwrap();
+        let far = alone["out.v_fwd"].iter().zip(&plain.get("out.v_fwd").data).map(|(a, b)| (a - b).abs());
+        assert!(far.fold(0.0, f32::max) < 1e-3);
+
+        let e = model.with_config(ModelConfig { causal_depth: 1, ..config.clone() }).unwrap_err();
+        assert!(e.to_string().contains("other tensors"), "{e}");
+        let e = model.with_config(ModelConfig { motion_tau: 2.0, ..config }).unwrap_err();
+        assert!(e.to_string().contains("motion.tau"), "{e}");
+    }
+}
+
 /// Frames whose motion map nobody reads are skipped, unless a tap looks.
 #[test]
 fn taps_change_no_result() {

@@ -148,12 +148,13 @@ def motion_maps(raw, times, pose, config):
     [F, H, W, 3] (world axes, scene units per second; v_bwd points where the surface came from) and dynamic [F, H, W].
     """
     frames = len(times)
-    reach = pass_ranges(config)
+    # A mask of no frames (an ablation) does not take away what there is to move towards.
+    k = max(1, config["mask.k"])
+    reach = pass_ranges(config | {"mask.k": k})
     if config["motion.layout"] == "single_pass":
         ahead, behind, logit = raw["fwd"].split((3, 3, 1), dim=-1)
         velocity = {"fwd": ahead, "bwd": behind}
         logits = {"fwd": logit[..., 0], "bwd": logit[..., 0]}
-        k = config["mask.k"]
         reach = {"fwd": (1, k), "bwd": (-k, -1)}
     else:
         velocity = {way: r[..., :3] for way, r in raw.items()}
