@@ -232,6 +232,20 @@ CASES = [
         },
     ),
     Case(
+        "guided_conf", 14, frames=3, rows=2, columns=3,
+        changes={
+            "patch": 14,
+            "guide.channels": 3,
+            "head.concat": "last",
+            **guided_head("conf", 1, 8, 1, 2, hidden=4, features=6),
+            **guided_head("gs", 11, 8, 0, 2, hidden=3, features=9),
+            **guided_head("motion", 7, 12, 1, 3, hidden=4, features=5),
+            "motion.layout": "single_pass",
+            "causal.registers": True,
+            "mask.k": 0,
+        },
+    ),
+    Case(
         "native_grid", 12, frames=2, rows=5, columns=5,
         changes={
             **trunk("encoder", 20, 1, 1, registers=0),

@@ -72,7 +72,9 @@ class StreetForward(nn.Module):
         mean, std = (torch.tensor(config[f"image.{key}"]).to(image) for key in ("mean", "std"))
         normal = ((image - mean) / std).permute(0, 3, 1, 2)
         patches = self.encoder(normal, note)
-        guide = note("guide", self.image_stem(normal)) if cfg.guided(config) else None
+        guide = self.image_stem(normal) if cfg.guided(config) else None
+        if guide is not None:
+            note("guide", guide.permute(0, 2, 3, 1))
 
         time = None
         if config["time.d_t"]:
