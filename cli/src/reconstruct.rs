@@ -25,13 +25,16 @@ pub(crate) fn context_clip(clip: &Clip, protocol: &Protocol) -> Clip {
     }
 }
 
-/// Size at which a network sees a clip: as asked, or that of its pictures in whole patches, shrunk to the
-/// pixels its position table was made for (and Pi3's limit).
+/// Size at which a network sees a clip: as asked; or of as many pixels as it was trained with; or that of its
+/// pictures in whole patches, shrunk to the pixels its position table was made for (and Pi3's limit).
 pub(crate) fn network_size(config: &ModelConfig, clip: &Clip, asked: Option<Size>) -> (u32, u32) {
     if let Some(size) = asked {
         return (size.width, size.height);
     }
     let (w, h) = clip.frames[0].image.size();
+    if let Some([tw, th]) = config.image_size {
+        return fit_size(w, h, config.patch, u64::from(tw) * u64::from(th));
+    }
     let table = u64::from(config.pos_grid * config.patch).pow(2);
     fit_size(w, h, config.patch, table.min(DEFAULT_PIXELS).min(u64::from(w) * u64::from(h)))
 }

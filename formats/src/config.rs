@@ -70,6 +70,8 @@ pub struct ModelConfig {
     pub image_std: [f64; 3],
     /// How frames are resized to the network's size.
     pub image_resample: Resample,
+    /// Width and height the network was trained at; pictures are brought to about as many pixels.
+    pub image_size: Option<[u32; 2]>,
 
     /// Image encoder (DINOv2 with registers).
     pub encoder: Trunk,
@@ -276,6 +278,7 @@ impl ModelConfig {
         v.field("image.mean", &mut self.image_mean)?;
         v.field("image.std", &mut self.image_std)?;
         v.field("image.resample", &mut self.image_resample)?;
+        v.field("image.size", &mut self.image_size)?;
         self.encoder.visit("encoder", v)?;
         v.field("encoder.pos_grid", &mut self.pos_grid)?;
         self.aa.visit("aa", v)?;
@@ -515,6 +518,8 @@ mod tests {
         refused("conf.kind must be none", &|c| c.conf = Head::xdec_linear(1, 16, 1, 1));
         let e = ModelConfig { guide_channels: 8, ..ModelConfig::base() }.check("f").unwrap_err();
         assert!(e.to_string().contains("no head is guided"), "{e}");
+        let e = ModelConfig { image_size: Some([168, 111]), ..ModelConfig::base() }.check("f").unwrap_err();
+        assert!(e.to_string().contains("image.size = [168, 111]"), "{e}");
         let e = ModelConfig { sky_conf: 1.5, ..ModelConfig::base() }.check("f").unwrap_err();
         assert!(e.to_string().contains("sky.conf"), "{e}");
     }

@@ -12,6 +12,11 @@ impl ModelConfig {
             if v < lo || v > hi { Err(Error::model(at, format!("{key} = {v} must be {lo}..{hi}"))) } else { Ok(()) }
         };
         range("patch", self.patch, 1, 64)?;
+        if let Some([w, h]) = self.image_size
+            && [w, h].iter().any(|&side| side == 0 || side > 1 << 14 || !side.is_multiple_of(self.patch))
+        {
+            return bad(format!("image.size = [{w}, {h}] must be two multiples of the patch, at most 16384"));
+        }
         range("encoder.pos_grid", self.pos_grid, 1, 256)?;
         for (p, t) in [("encoder", &self.encoder), ("aa", &self.aa)] {
             range(&format!("{p}.dim"), t.dim, 4, 8192)?;

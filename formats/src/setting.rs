@@ -91,6 +91,19 @@ impl Setting for Vec<u32> {
     }
 }
 
+impl Setting for Option<[u32; 2]> {
+    fn to_value(&self) -> Value {
+        Value::Ints(self.iter().flatten().map(|&i| i64::from(i)).collect())
+    }
+    fn from_value(v: &Value) -> Option<Self> {
+        match <Vec<u32>>::from_value(v)?[..] {
+            [] => Some(None),
+            [a, b] => Some(Some([a, b])),
+            _ => None,
+        }
+    }
+}
+
 impl Setting for [f64; 3] {
     fn to_value(&self) -> Value {
         Value::Floats(self.to_vec())

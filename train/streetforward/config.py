@@ -77,6 +77,7 @@ def full():
         "image.mean": [0.485, 0.456, 0.406],
         "image.std": [0.229, 0.224, 0.225],
         "image.resample": "bicubic",
+        "image.size": [],
         **trunk("encoder", 1024, 24, 16, registers=4),
         "encoder.pos_grid": 37,
         **trunk("aa", 1024, 36, 16, registers=5),
@@ -155,6 +156,7 @@ def base():
 def nano():
     """About 4.2 M parameters: the network that is trained from scratch on generated streets."""
     return full() | {
+        "image.size": [168, 112],
         **trunk("encoder", 128, 4, 2, registers=4),
         "encoder.pos_grid": 16,
         **trunk("aa", 128, 6, 2, registers=5),
@@ -178,6 +180,7 @@ def nano():
         "motion.bias": -2.0,
         "sky.mode": "far_shell",
         "sky.conf": 0.5,
+        "splat.eps2d": 0.1,
     }
 
 
