@@ -84,11 +84,44 @@ fn eval_reports_the_model_and_the_trivial_alternatives() {
     // A copy of the nearest picture shows the street, untrained weights do not.
     let copy = json["baselines"]["copy_nearest"]["psnr_full_db"].as_f64().unwrap();
     assert!(copy > json["psnr_full_db"].as_f64().unwrap() && copy > 10.0, "{copy}");
-    assert!(json["ablations"]["static_only"]["psnr_full_db"].is_number());
-    assert!(ok(&args).contains("| frames | method |"));
+    assert!(json["ablations"]["no_motion"]["psnr_full_db"].is_number());
+    assert!(ok(&args).contains("| frames        | method "));
+    // True geometry through the same renderer.
+    let oracle = &json["bounds"]["oracle"];
+    assert!(oracle["psnr_full_db"].as_f64() > json["psnr_full_db"].as_f64(), "{oracle}");
+    assert!(oracle["velocity_epe_ratio"].as_f64().unwrap() < 0.2 && oracle["rotation_deg"].as_f64().unwrap() < 1e-6);
+    assert!(json["context_depth_absrel"].is_number() && json["sky_iou"].is_number());
+    assert!(json["ablations"]["no_causal"].is_null());
     ok(&[&args[..], &["--target-poses", "aligned-truth"]].concat());
     fails(2, &["eval", "-m", s(&model)]);
     fails(6, &["eval", "-m", s(&model), "--data", "/nonexistent"]);
+}
+
+#[test]
+fn eval_draws_held_out_streets_and_writes_its_table() {
+    let dir = tempfile::tempdir().unwrap();
+    let (model, out) = (dir.path().join("tiny.sfw"), dir.path().join("out"));
+    fs::write(&model, tiny_blob()).unwrap();
+    let args = ["eval", "-m", s(&model), "--synth-heldout", "2", "--seed", "3", "--size", "56x42", "--ablations"];
+    let json = ok_json(&[&args[..], &["-o", s(&out)]].concat());
+    let seeds: Vec<u64> = json["data"].as_array().unwrap().iter().map(|d| d["seed"].as_u64().unwrap()).collect();
+    assert_eq!(seeds, sf_synth::Split::HeldOut.seeds(3).take(2).collect::<Vec<_>>());
+    assert_eq!((json["interpolation_frames"].as_u64(), json["extrapolation_frames"].as_u64()), (Some(24), Some(8)));
+    for (group, key) in [
+        ("ablations", "no_motion"),
+        ("ablations", "forward_only"),
+        ("ablations", "no_causal"),
+        ("baselines", "copy_nearest"),
+        ("bounds", "oracle"),
+        ("bounds", "oracle_no_motion"),
+    ] {
+        assert!(json[group][key]["interpolation"]["psnr_full_db"].is_number(), "{group}.{key}");
+    }
+    let file = |name: &str| fs::read_to_string(out.join(name)).unwrap();
+    assert_eq!(serde_json::from_str::<serde_json::Value>(&file("eval.json")).unwrap(), json);
+    assert!(file("eval.md").contains("| interpolation | oracle_no_motion |"), "{}", file("eval.md"));
+    fails(2, &["eval", "--synth-heldout", "0"]);
+    fails(2, &["eval", "--synth-heldout", "1", "--data", "x"]);
 }
 
 #[test]

@@ -8,6 +8,7 @@
 //! * Depth: D / alpha, compared where the true depth is in (0, `max_depth`]; a pixel where nothing was drawn counts
 //!   with depth 0. Also after scaling each frame by the ratio of medians, as the model is up to scale.
 //! * Dynamic pixels: true speed above 1 unit per second; without true velocity, the true mask.
+//! * Depth of the network itself and sky: at the context frames, where the caller has them ([`Subject`]).
 //! * Velocity and dynamic probability: rendered like colour at the context frames, divided by alpha. A Gaussian's
 //!   velocity is v+ in the first frame, -v- in the last, (v+ - v-)/2 between, 0 when it is static.
 
@@ -16,7 +17,7 @@ use crate::metrics;
 use crate::protocol::{EvalClip, EvalFrame, EvalOptions, Protocol, TargetPoses};
 use crate::report::{EvalReport, Method, Metric, Part, Scores};
 use crate::ssim::SsimMap;
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use sf_formats::config::{SelfRule, Split};
 use sf_formats::image_io::Rgb8;
 use sf_formats::scene::{Compose, Scene};
@@ -24,24 +25,87 @@ use sf_formats::{Camera, Error, Gaussians, Pose, Result};
 use sf_ops::resize::{Filter, resample_u8};
 use sf_splat::{RenderOptions, Rendered, Renderer};
 
-/// Measures a scene that was reconstructed from the context frames of a clip.
+/// A scene that is measured, and what its network says of the context frames directly.
+#[derive(Clone, Copy, Debug)]
+pub struct Subject<'a> {
+    /// The reconstruction.
+    pub scene: &'a Scene,
+    /// z-depth of the context frames at the size of the scene's cameras, scene units, frame after frame.
+    pub depth: Option<&'a [f32]>,
+    /// Whether each of these pixels is taken for sky.
+    pub sky: Option<&'a [bool]>,
+}
+
+impl<'a> From<&'a Scene> for Subject<'a> {
+    fn from(scene: &'a Scene) -> Subject<'a> {
+        Subject { scene, depth: None, sky: None }
+    }
+}
+
+/// Measures a scene that was reconstructed from the context frames of a clip, beside the same scene without motion
+/// and copies of the context frames. More methods are added with [`measure`].
 ///
 /// # Errors
 /// Status 3 when the clip is shorter than the protocol, the scene's frames are not the context frames, or true
 /// poses are asked for and missing; and whatever rendering returns.
 pub fn evaluate(clip: &EvalClip, scene: &Scene, renderer: &mut Renderer, options: &EvalOptions) -> Result<EvalReport> {
+    evaluate_subject(clip, &scene.into(), renderer, options)
+}
+
+/// [`evaluate`] with the network's own depth and sky.
+pub fn evaluate_subject(
+    clip: &EvalClip,
+    subject: &Subject,
+    renderer: &mut Renderer,
+    options: &EvalOptions,
+) -> Result<EvalReport> {
     let protocol = &options.protocol;
-    check(clip, scene, protocol)?;
+    check(clip, subject.scene, protocol)?;
     let mut report = EvalReport::empty(protocol.name, options.target_poses.name());
     (report.clips, report.context_frames) = (1, protocol.context.len());
-    let alignment = fit(clip, scene, protocol)?;
-    if let Some((similarity, truth)) = &alignment {
-        pose_errors(scene, truth, similarity, report.scores_mut(Method::Model, Part::All));
+    let camera = subject.scene.frames[0].camera;
+    let size = (camera.width, camera.height);
+    for target in protocol.targets() {
+        let part = protocol.part(target);
+        match part {
+            Part::Extrapolation => report.extrapolation_frames += 1,
+            Part::All | Part::Interpolation => report.interpolation_frames += 1,
+        }
+        let mut scores = Scores::default();
+        let nearest = clip.frames[protocol.nearest(clip, target)].image;
+        picture_scores(&picture(nearest, size), &Truth::new(&clip.frames[target], size, options), &mut scores);
+        count(&mut report, Method::CopyNearest, part, &scores);
     }
+    measure(&mut report, Method::Model, clip, subject, (&mut *renderer, options))?;
+    measure(&mut report, Method::NoMotion, clip, &(&standing(subject.scene)).into(), (renderer, options))?;
+    Ok(report)
+}
+
+/// Measures one more scene of the same clip into a report, under the name of `method`.
+///
+/// Oracles are seen by the true cameras; [`Method::ForwardOnly`] leaves out the dynamic Gaussians of the context
+/// frame after each target (beyond the ends nothing changes).
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn measure(
+    report: &mut EvalReport,
+    method: Method,
+    clip: &EvalClip,
+    subject: &Subject,
+    (renderer, options): (&mut Renderer, &EvalOptions),
+) -> Result<()> {
+    let (protocol, scene) = (&options.protocol, subject.scene);
+    check(clip, scene, protocol)?;
+    let alignment = fit(clip, scene, protocol)?;
+    let poses = match method {
+        Method::Oracle | Method::OracleNoMotion => TargetPoses::AlignedTruth,
+        _ => options.target_poses,
+    };
     let mut bench = Bench { scene, renderer, options, gaussians: Gaussians::default(), out: Rendered::default() };
     for target in protocol.targets() {
         let frame = &clip.frames[target];
-        let camera = match options.target_poses {
+        let camera = match poses {
             TargetPoses::Predicted => scene.camera_at(frame.time)?,
             TargetPoses::AlignedTruth => {
                 let Some((similarity, pose)) = alignment.as_ref().map(|a| a.0).zip(frame.pose) else {
@@ -53,28 +117,46 @@ pub fn evaluate(clip: &EvalClip, scene: &Scene, renderer: &mut Renderer, options
                 Camera { pose: similarity.to_predicted(&pose), ..scene.camera_at(frame.time)? }
             }
         };
-        let part = protocol.part(target);
-        match part {
-            Part::Extrapolation => report.extrapolation_frames += 1,
-            Part::All | Part::Interpolation => report.interpolation_frames += 1,
-        }
-        let size = (camera.width, camera.height);
-        let truth = Truth::new(frame, size, options);
-        let motionless = Compose { split: Split::Hard, tau: f32::INFINITY, ..scene.compose };
-        for (method, rules) in [(Method::Model, scene.compose), (Method::StaticOnly, motionless)] {
-            bench.render(frame.time, &rules, &camera)?;
-            let mut scores = Scores::default();
-            picture_scores(&bench.out.rgb, &truth, &mut scores);
-            depth_scores(&bench.out.expected_depth(), &truth, &mut scores);
-            count(&mut report, method, part, &scores);
+        let truth = Truth::new(frame, (camera.width, camera.height), options);
+        if method == Method::ForwardOnly {
+            let forward = forward_only(scene, frame.time);
+            bench.render_scene(&forward, (frame.time, &scene.compose), &camera, options.background)?;
+        } else {
+            bench.render_scene(scene, (frame.time, &scene.compose), &camera, options.background)?;
         }
         let mut scores = Scores::default();
-        let nearest = clip.frames[protocol.nearest(clip, target)].image;
-        picture_scores(&picture(nearest, size), &truth, &mut scores);
-        count(&mut report, Method::CopyNearest, part, &scores);
+        picture_scores(&bench.out.rgb, &truth, &mut scores);
+        depth_scores(&bench.out.expected_depth(), &truth, &mut scores);
+        count(report, method, protocol.part(target), &scores);
     }
-    motion_scores(&mut bench, clip, alignment.map(|a| a.0), &mut report)?;
-    Ok(report)
+    if matches!(method, Method::Model | Method::NoCausal | Method::Oracle) {
+        if let Some((similarity, truth)) = &alignment {
+            pose_errors(scene, truth, similarity, report.scores_mut(method, Part::All));
+        }
+        context_scores(clip, subject, options, report.scores_mut(method, Part::All));
+        motion_scores(&mut bench, clip, alignment, report.scores_mut(method, Part::All))?;
+    }
+    Ok(())
+}
+
+/// The scene with every velocity zero.
+pub fn standing(scene: &Scene) -> Scene {
+    let still = vec![[0.0; 3]; scene.len()];
+    Scene { v_fwd: still.clone(), v_bwd: still, ..scene.clone() }
+}
+
+/// The scene without the dynamic Gaussians of context frames after `time`, unless no frame is before.
+fn forward_only(scene: &Scene, time: f64) -> Scene {
+    let mut forward = scene.clone();
+    if scene.frames.first().is_some_and(|f| f.time < time) {
+        for i in 0..scene.len() {
+            let later = scene.frames.get(scene.source[i] as usize).is_some_and(|f| f.time > time);
+            if later && scene.dynamic[i] > scene.compose.tau {
+                forward.gaussians.opacity[i] = 0.0;
+            }
+        }
+    }
+    forward
 }
 
 fn check(clip: &EvalClip, scene: &Scene, protocol: &Protocol) -> Result<()> {
@@ -122,6 +204,8 @@ fn pose_errors(scene: &Scene, truth: &[Pose], similarity: &Similarity, scores: &
         if i > 0 {
             let (p, t) = (to_first_p.then(&predicted(i)), to_first_t.then(&truth[i]));
             scores.add(Metric::RotationDeg, Some(metrics::rotation_error_deg(&p.r, &t.r)));
+            scores.add(Metric::RotationIdentityDeg, Some(metrics::rotation_error_deg(&DMat3::IDENTITY, &t.r)));
+            scores.add(Metric::Travel, Some(t.t.length()));
             scores.add(Metric::TranslationDirectionDeg, metrics::direction_error_deg(p.t, t.t));
             scores.add(Metric::TranslationError, Some((p.t - t.t).length()));
         }
@@ -138,11 +222,6 @@ struct Bench<'a> {
 }
 
 impl Bench<'_> {
-    fn render(&mut self, time: f64, rules: &Compose, camera: &Camera) -> Result<()> {
-        let scene = self.scene;
-        self.render_scene(scene, (time, rules), camera, self.options.background)
-    }
-
     fn render_scene(
         &mut self,
         scene: &Scene,
@@ -175,6 +254,8 @@ struct Truth {
     rgb: Vec<f32>,
     depth: Vec<f32>,
     valid: Vec<bool>,
+    /// No surface is seen.
+    sky: Vec<bool>,
     velocity: Option<Vec<[f32; 3]>>,
     /// `None` when it is not known which pixels are dynamic.
     dynamic: Option<Vec<bool>>,
@@ -183,11 +264,13 @@ struct Truth {
 impl Truth {
     fn new(frame: &EvalFrame, size: (u32, u32), options: &EvalOptions) -> Truth {
         let rgb = picture(frame.image, size);
-        let mut truth = Truth { size, rgb, depth: Vec::new(), valid: Vec::new(), velocity: None, dynamic: None };
+        let (depth, valid, sky) = (Vec::new(), Vec::new(), Vec::new());
+        let mut truth = Truth { size, rgb, depth, valid, sky, velocity: None, dynamic: None };
         if let Some(known) = frame.truth {
             let pick = nearest_pixels((known.width, known.height), size);
             truth.depth = pick.iter().map(|&i| known.depth[i]).collect();
             truth.valid = truth.depth.iter().map(|&d| d > 0.0 && d <= options.max_depth).collect();
+            truth.sky = truth.depth.iter().map(|&d| d <= 0.0).collect();
             truth.velocity = known.velocity.as_ref().map(|v| pick.iter().map(|&i| v[i]).collect());
             let fast = |v: &[f32; 3]| metrics::vec3(*v).length() > f64::from(options.dynamic_speed);
             truth.dynamic = match (&truth.velocity, &known.dynamic) {
@@ -256,12 +339,39 @@ fn depth_scores(depth: &[f32], truth: &Truth, scores: &mut Scores) {
     }
 }
 
-/// Velocity and mask at the context frames, of the model and of the ablation that moves nothing.
+/// The network's own depth and sky at the context frames.
+fn context_scores(clip: &EvalClip, subject: &Subject, options: &EvalOptions, scores: &mut Scores) {
+    let frames = subject.scene.frames.len();
+    for (f, &c) in options.protocol.context.iter().enumerate() {
+        let camera = subject.scene.frames[f].camera;
+        let truth = Truth::new(&clip.frames[c], (camera.width, camera.height), options);
+        let pixels = truth.depth.len();
+        if pixels == 0 {
+            continue;
+        }
+        if let Some(depth) = subject.depth {
+            assert_eq!(depth.len(), frames * pixels, "depth of the context frames");
+            let depth = &depth[f * pixels..][..pixels];
+            let errors = |scale: f64| metrics::depth_errors(depth, &truth.depth, &truth.valid, scale);
+            let scaled = metrics::median_scale(depth, &truth.depth, &truth.valid).and_then(errors);
+            scores.add(Metric::ContextDepthAbsRel, errors(1.0).map(|e| e.abs_rel));
+            scores.add(Metric::ContextDepthRmse, errors(1.0).map(|e| e.rmse));
+            scores.add(Metric::ContextDepthAbsRelScaled, scaled.map(|e| e.abs_rel));
+        }
+        if let Some(sky) = subject.sky {
+            assert_eq!(sky.len(), frames * pixels, "sky of the context frames");
+            let (both, either) = metrics::overlap(&sky[f * pixels..][..pixels], &truth.sky);
+            scores.add_sum(Metric::SkyIou, both as f64, either as f64);
+        }
+    }
+}
+
+/// Velocity and mask at the context frames.
 fn motion_scores(
     bench: &mut Bench,
     clip: &EvalClip,
-    alignment: Option<Similarity>,
-    report: &mut EvalReport,
+    alignment: Option<(Similarity, Vec<Pose>)>,
+    scores: &mut Scores,
 ) -> Result<()> {
     let scene = bench.scene;
     let (velocity, probability) = painted(scene);
@@ -272,31 +382,31 @@ fn motion_scores(
         let predicted: Vec<bool> =
             bench.context_map(&probability, f)?.iter().map(|p| p[0] > scene.compose.tau).collect();
         let (both, either) = metrics::overlap(&predicted, dynamic);
-        let model = report.scores_mut(Method::Model, Part::All);
-        model.add_sum(Metric::DynamicIou, both as f64, either as f64);
-        let moving = metrics::count(dynamic) as f64;
-        report.scores_mut(Method::StaticOnly, Part::All).add_sum(Metric::DynamicIou, 0.0, moving);
+        scores.add_sum(Metric::DynamicIou, both as f64, either as f64);
         // Without true poses the axes of the true velocity are unknown.
-        let (Some(true_velocity), Some(similarity)) = (&truth.velocity, alignment) else { continue };
+        let (Some(true_velocity), Some((similarity, poses))) = (&truth.velocity, &alignment) else { continue };
         let map: Vec<DVec3> =
             bench.context_map(&velocity, f)?.into_iter().map(|v| similarity.r * metrics::vec3(v)).collect();
         let single = |scale: f64| map.iter().map(|v| (*v * scale).as_vec3().to_array()).collect::<Vec<_>>();
         let nothing = vec![[0.0; 3]; map.len()];
         let fixed: Vec<bool> = truth.valid.iter().zip(dynamic).map(|(v, d)| *v && !d).collect();
-        let (raw, n) = metrics::velocity_error(&single(1.0), true_velocity, dynamic);
-        let (scaled, _) = metrics::velocity_error(&single(similarity.scale), true_velocity, dynamic);
-        let (speed, _) = metrics::velocity_error(&nothing, true_velocity, dynamic);
-        let (ghost, still) = metrics::velocity_error(&single(1.0), &nothing, &fixed);
-        let model = report.scores_mut(Method::Model, Part::All);
-        model.add_sum(Metric::VelocityEpe, raw, n as f64);
-        model.add_sum(Metric::VelocityEpeScaled, scaled, n as f64);
-        model.add_sum(Metric::VelocitySpeed, speed, n as f64);
-        model.add_sum(Metric::StaticSpeed, ghost, still as f64);
-        let ablation = report.scores_mut(Method::StaticOnly, Part::All);
-        for metric in [Metric::VelocityEpe, Metric::VelocityEpeScaled, Metric::VelocitySpeed] {
-            ablation.add_sum(metric, speed, n as f64);
+        let across = |v: &[f32; 3]| {
+            let v = poses[f].r.transpose() * metrics::vec3(*v);
+            v.x.abs() > v.z.abs()
+        };
+        let crossing: Vec<bool> = dynamic.iter().zip(true_velocity).map(|(d, v)| *d && across(v)).collect();
+        let (raw, scaled) = (single(1.0), single(similarity.scale));
+        for (metric, map, truth, mask) in [
+            (Metric::VelocityEpe, &raw, true_velocity, dynamic),
+            (Metric::VelocityEpeScaled, &scaled, true_velocity, dynamic),
+            (Metric::VelocitySpeed, &nothing, true_velocity, dynamic),
+            (Metric::VelocityEpeCrossing, &raw, true_velocity, &crossing),
+            (Metric::VelocitySpeedCrossing, &nothing, true_velocity, &crossing),
+            (Metric::StaticSpeed, &raw, &nothing, &fixed),
+        ] {
+            let (sum, n) = metrics::velocity_error(map, truth, mask);
+            scores.add_sum(metric, sum, n as f64);
         }
-        ablation.add_sum(Metric::StaticSpeed, 0.0, still as f64);
     }
     Ok(())
 }

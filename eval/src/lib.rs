@@ -7,7 +7,7 @@
 //! | `align.rs` | the similarity transform between two sets of poses |
 //! | `protocol.rs` | [`Protocol`]: which frames are context, which are tested, with which cameras |
 //! | `oracle_scene.rs` | [`oracle_scene()`]: the scene of a perfect network, from ground truth |
-//! | `evaluate.rs` | [`evaluate()`]: the measurement of a scene on them |
+//! | `evaluate.rs` | [`evaluate()`]: the measurement of a scene on them; [`measure`]: of one more |
 //! | `compare.rs` | [`Comparison`]: one model's predictions against another's; gates |
 //! | `report.rs` | [`EvalReport`]: means per method and part, as JSON and as a Markdown table |
 #![deny(unsafe_code)]
@@ -22,7 +22,7 @@ pub mod report;
 pub mod ssim;
 
 pub use compare::{Comparison, Gate, INT8_GATES, Side, StageMatch};
-pub use evaluate::evaluate;
+pub use evaluate::{Subject, evaluate, evaluate_subject, measure, standing};
 pub use oracle_scene::{OracleFrame, OracleOptions, oracle_of_clip, oracle_scene};
 pub use protocol::{EvalClip, EvalFrame, EvalOptions, Protocol, TargetPoses};
 pub use report::{EvalReport, Method, Metric, Part, Scores};

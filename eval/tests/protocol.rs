@@ -1,7 +1,10 @@
 //! The protocol on a street so small that everything about it is known: a wall and a moving box.
 
 use glam::DVec3;
-use sf_eval::{EvalClip, EvalFrame, EvalOptions, EvalReport, Method, Metric, Part, Protocol, TargetPoses, evaluate};
+use sf_eval::{
+    EvalClip, EvalFrame, EvalOptions, EvalReport, Method, Metric, Part, Protocol, Subject, TargetPoses, evaluate,
+    evaluate_subject, measure,
+};
 use sf_formats::clip::TruthFrame;
 use sf_formats::image_io::Rgb8;
 use sf_formats::scene::{Compose, Gaussians, Scene, SceneFrame, SplatSettings};
@@ -141,17 +144,58 @@ fn a_true_scene_scores_high_and_its_ablations_lower() {
     assert!(model(Metric::RotationDeg) < 1e-6 && model(Metric::TranslationError) < 1e-9);
     for part in [Part::Interpolation, Part::Extrapolation] {
         let gain = |other, metric| get(Method::Model, part, metric) - get(other, part, metric);
-        // Without motion the box stands still in several places at once.
-        assert!(gain(Method::StaticOnly, Metric::PsnrDynamic) > 6.0, "{part:?}");
-        assert!(gain(Method::StaticOnly, Metric::SsimDynamic) > 0.1, "{part:?}");
+        // Without motion the box stands still between the frames.
+        assert!(gain(Method::NoMotion, Metric::PsnrDynamic) > 6.0, "{part:?}");
+        assert!(gain(Method::NoMotion, Metric::SsimDynamic) > 0.1, "{part:?}");
         assert!(gain(Method::CopyNearest, Metric::PsnrDynamic) > 6.0, "{part:?}");
         assert!(gain(Method::CopyNearest, Metric::PsnrFull) > 3.0, "{part:?}");
         let depth = |method| get(method, part, Metric::DepthRmseDynamic);
-        assert!(depth(Method::StaticOnly) > depth(Method::Model), "{part:?}");
+        assert!(depth(Method::NoMotion) > depth(Method::Model), "{part:?}");
     }
-    assert_eq!(get(Method::StaticOnly, Part::All, Metric::VelocityEpe), f64::from(BOX_SPEED));
-    assert_eq!(get(Method::StaticOnly, Part::All, Metric::DynamicIou), 0.0);
+    // The box crosses the view.
+    assert_eq!(model(Metric::VelocityEpeCrossing), model(Metric::VelocityEpe));
+    assert_eq!(model(Metric::RotationIdentityDeg), 0.0);
+    // Context frames at 0.5, 1.0 and 1.5 seconds.
+    assert!((model(Metric::Travel) - 0.29f64.sqrt()).abs() < 1e-9);
     assert_eq!(report.scores(Method::CopyNearest, Part::All).get(Metric::DepthRmseFull), None);
+}
+
+#[test]
+fn oracles_and_ablations_are_added() {
+    let frames: Vec<Frame> = (0..FRAMES).map(frame).collect();
+    let context = [0, 5, 10, 15];
+    let scene = perfect_scene(&frames, &context);
+    let options = EvalOptions::new(Protocol::storm20(FRAMES).unwrap());
+    let renderer = &mut Renderer::new(2).unwrap();
+    // The network's own depth is true, its sky covers the upper half; nothing is sky.
+    let depth: Vec<f32> = context.iter().flat_map(|&c| frames[c].truth.depth.clone()).collect();
+    let pixels = (SIZE.0 * SIZE.1) as usize;
+    let sky: Vec<bool> = (0..4 * pixels).map(|i| i % pixels < pixels / 2).collect();
+    let subject = Subject { scene: &scene, depth: Some(&depth), sky: Some(&sky) };
+    let mut report = evaluate_subject(&clip(&frames), &subject, renderer, &options).unwrap();
+    let plain = run(&frames, &scene, TargetPoses::Predicted);
+    assert_eq!(report.get(Metric::PsnrFull), plain.get(Metric::PsnrFull));
+    assert_eq!((report.get(Metric::ContextDepthAbsRel), report.get(Metric::SkyIou)), (Some(0.0), Some(0.0)));
+    assert_eq!(plain.get(Metric::SkyIou), None);
+
+    // A backward pass that is wrong does not hurt what looks forward only.
+    let mut wrong = scene.clone();
+    wrong.v_bwd.iter_mut().for_each(|v| *v = v.map(|x| -2.0 * x));
+    for (method, scene) in [(Method::NoCausal, &wrong), (Method::ForwardOnly, &wrong), (Method::Oracle, &scene)] {
+        measure(&mut report, method, &clip(&frames), &scene.into(), (renderer, &options)).unwrap();
+    }
+    let get = |m: Method, metric| report.scores(m, Part::Interpolation).get(metric).unwrap();
+    // A box that flies off backwards leaves the place of the other one, which is drawn right.
+    let full = |m| get(m, Metric::PsnrFull);
+    assert!(full(Method::NoCausal) + 6.0 < full(Method::ForwardOnly), "{}", report.to_markdown());
+    let dynamic = |m| get(m, Metric::PsnrDynamic);
+    assert!(dynamic(Method::ForwardOnly) > dynamic(Method::NoMotion) + 6.0);
+    assert!((dynamic(Method::Oracle) - dynamic(Method::Model)).abs() < 0.5);
+    let json = report.to_json();
+    assert!(json["bounds"]["oracle"]["interpolation"]["psnr_full_db"].is_number());
+    assert!(json["ablations"]["forward_only"]["psnr_full_db"].is_number());
+    assert_eq!(report.methods().count(), 6);
+    assert_eq!(json["velocity_epe_crossing_ratio"], json["velocity_epe_ratio"]);
 }
 
 #[test]

@@ -26,7 +26,8 @@ pub(crate) struct Args {
     clip: ClipArgs,
     #[command(flatten)]
     folder: FolderArgs,
-    /// Weight blob (.sfw), or a checkpoint, which is converted for this run; without it a random nano network
+    /// Weight blob (.sfw), or a checkpoint, which is converted for this run; without it the trained nano network
+    /// inside the binary
     #[arg(short, long, value_name = "MODEL")]
     model: Option<PathBuf>,
     /// Network size in pixels, multiples of the patch; default: the pictures', shrunk to what the network
@@ -90,7 +91,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     };
     let loaded = model::load(args.model.as_deref(), &args.engine, args.precision, console)?;
     let config = loaded.model.config();
-    if args.emit.contains(&Emit::Conf) && !config.conf.exists() {
+    if args.emit.contains(&Emit::Conf) && !config.has_conf() {
         return Err(Error::usage("--emit conf: this network has no confidence head"));
     }
     let size = reconstruct::network_size(config, &clip, args.size);
