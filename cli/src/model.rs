@@ -1,4 +1,5 @@
-//! [`Loaded`]: the model of a verb: a blob, a checkpoint converted for this run, or random weights.
+//! [`Loaded`]: the model of a verb: a blob, a checkpoint converted for this run, the trained network inside the
+//! binary, or random weights.
 
 use crate::args::{EngineArgs, Precision};
 use crate::network::Watched;
@@ -17,15 +18,31 @@ use std::sync::Arc;
 use std::time::Instant;
 use streetforward::Model;
 
-/// Seed of the network that stands in where no model is given.
+/// Seed of the network that stands in where no model is given and none is built in.
 const RANDOM_SEED: u64 = 1;
+
+/// The trained nano network, where it was built in.
+#[cfg(has_model)]
+const EMBEDDED: Option<&[u8]> = Some(include_bytes!("../../models/nano/nano.sfw"));
+#[cfg(not(has_model))]
+const EMBEDDED: Option<&[u8]> = None;
+
+/// Where weights came from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Origin {
+    /// A file or folder of the user's.
+    Path(PathBuf),
+    /// The binary.
+    Embedded,
+    /// A seed.
+    Random,
+}
 
 /// A model and where it came from.
 pub(crate) struct Loaded {
     /// The model.
     pub(crate) model: Arc<Model>,
-    /// File, or none for the random network.
-    path: Option<PathBuf>,
+    origin: Origin,
     /// Milliseconds to open, convert and verify.
     load_ms: f64,
 }
@@ -34,8 +51,12 @@ impl Loaded {
     /// For reports.
     pub(crate) fn json(&self) -> Value {
         json!({
-            "path": self.path.as_ref().map(|p| p.to_string_lossy().into_owned()),
-            "random_weights": self.path.is_none(),
+            "path": match &self.origin {
+                Origin::Path(p) => Some(p.to_string_lossy()),
+                Origin::Embedded | Origin::Random => None,
+            },
+            "embedded": self.origin == Origin::Embedded,
+            "random_weights": self.random(),
             "digest": hex(self.model.blob().digest()),
             "parameters": self.model.parameters(),
             "weights_bytes": self.model.blob().file_bytes(),
@@ -43,32 +64,40 @@ impl Loaded {
         })
     }
 
+    /// Whether the weights mean nothing.
+    pub(crate) fn random(&self) -> bool {
+        self.origin == Origin::Random
+    }
+
     /// Provenance that stays with a scene.
     pub(crate) fn notes(&self, clip: &Path) -> Vec<(String, String)> {
         vec![
             ("generator".into(), format!("streetforward {}", env!("CARGO_PKG_VERSION"))),
             ("model_digest".into(), hex(self.model.blob().digest())),
-            ("random_weights".into(), self.path.is_none().to_string()),
+            ("random_weights".into(), self.random().to_string()),
             ("clip".into(), clip.to_string_lossy().into_owned()),
         ]
     }
 }
 
-/// Opens a blob; converts a checkpoint into a temporary blob first; without a path makes the random nano
-/// network in memory and says so.
+/// Opens a blob; converts a checkpoint into a temporary blob first. Without a path: the network inside the binary;
+/// where there is none, the random nano network, and a warning.
 pub(crate) fn load(path: Option<&Path>, engine: &EngineArgs, to: Precision, console: &Console) -> Result<Loaded> {
     let start = Instant::now();
-    let blob = match path {
-        None => {
+    let mut origin = path.map_or(Origin::Embedded, |p| Origin::Path(p.to_path_buf()));
+    let blob = match (path, EMBEDDED) {
+        (None, Some(bytes)) => Blob::from_bytes(bytes)?,
+        (None, None) => {
+            origin = Origin::Random;
             console.warn("no model given: a nano network with random weights runs, its result is noise");
             let seeded = Seeded::new(&ModelConfig::nano(), RANDOM_SEED, Outputs::Random)?;
             Blob::from_bytes(&convert_to_bytes(&seeded, &Options::to(to.dtype()))?)?
         }
-        Some(path) if is_checkpoint(path)? => from_checkpoint(path, to, console)?,
-        Some(path) => Blob::open(path, engine.load.mode(), Verify::Digests)?,
+        (Some(path), _) if is_checkpoint(path)? => from_checkpoint(path, to, console)?,
+        (Some(path), _) => Blob::open(path, engine.load.mode(), Verify::Digests)?,
     };
     let model = Arc::new(Model::from_blob(blob)?);
-    Ok(Loaded { model, path: path.map(Path::to_path_buf), load_ms: start.elapsed().as_secs_f64() * 1e3 })
+    Ok(Loaded { model, origin, load_ms: start.elapsed().as_secs_f64() * 1e3 })
 }
 
 /// Whether a path holds a checkpoint; everything else is left to the blob reader and its messages.

@@ -2,10 +2,13 @@
 
 mod common;
 
-use common::{command, error_line, fails, files, ok, ok_json, ran, run, tiny_blob};
+use common::{command, error_line, fails, files, ok, ok_json, ran, run, tiny_blob, tiny_config};
+use sf_formats::Dtype;
 use sf_formats::atomic::Overwrite;
+use sf_formats::config::{Head, ModelConfig};
 use sf_formats::image_io::{self, Rgb8};
 use sf_formats::{Scene, npy};
+use sf_quant::{Options, Outputs, Seeded, convert_to_bytes};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -125,16 +128,27 @@ fn a_checkpoint_is_converted_for_the_run() {
 }
 
 #[test]
-fn without_a_model_random_weights_run_and_it_says_so() {
+fn without_a_model_the_built_in_one_runs_or_random_weights_that_say_so() {
     let (dir, _, clip) = workplace(2);
     let out = dir.path().join("out");
-    let r = run(&["run", "-i", s(&clip), "-o", s(&out), "--json", "-q"]);
+    let r = run(&["run", "-i", s(&clip), "-o", s(&out), "--json", "-q", "--emit", "conf"]);
     assert_eq!(r.code, 0, "{}", r.stderr);
-    assert!(r.stderr.contains("random weights"), "{}", r.stderr);
     let json: serde_json::Value = serde_json::from_str(&r.stdout).unwrap();
-    assert_eq!(json["model"]["random_weights"], true);
-    // It has no confidence head.
-    let line = error_line(&run(&["run", "-i", s(&clip), "-o", s(&out), "--force", "-q", "--emit", "conf"]).stderr[..]);
+    let random = json["model"]["random_weights"].as_bool().unwrap();
+    assert_eq!(json["model"]["embedded"], !random);
+    assert_eq!(r.stderr.contains("random weights"), random, "{}", r.stderr);
+    assert_eq!(json["model"]["parameters"], 4_398_074);
+}
+
+#[test]
+fn what_a_network_does_not_predict_is_not_emitted() {
+    let (dir, _, clip) = workplace(2);
+    let out = dir.path().join("out");
+    let model = dir.path().join("bare.sfw");
+    let config = ModelConfig { conf: Head::none(), ..tiny_config() };
+    let seeded = Seeded::new(&config, 1, Outputs::Random).unwrap();
+    fs::write(&model, convert_to_bytes(&seeded, &Options::to(Dtype::F32)).unwrap()).unwrap();
+    let line = fails(2, &["run", "-m", s(&model), "-i", s(&clip), "-o", s(&out), "-q", "--emit", "conf"]);
     assert!(line.contains("confidence"), "{line}");
 }
 

@@ -42,7 +42,7 @@ use std::time::Instant;
 pub(crate) struct Args {
     #[command(flatten)]
     folder: FolderArgs,
-    /// Weight blob (.sfw) or checkpoint; without it a random nano network, whose result is noise
+    /// Weight blob (.sfw) or checkpoint; without it the trained nano network inside the binary
     #[arg(short, long, value_name = "MODEL")]
     model: Option<PathBuf>,
     /// The street; a seed that models may be trained on gives way to the next that they may not
@@ -108,7 +108,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
 
     let options = EvalOptions::new(protocol);
     let scores = evaluate(&EvalClip::new(&clip, truth.as_ref()), &scene, &mut renderer, &options)?;
-    let random = args.model.is_none();
+    let random = loaded.random();
     let mut json = json!({
         "schema": "streetforward.demo/1",
         "output": path_json(&args.folder.output),

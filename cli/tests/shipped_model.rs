@@ -1,0 +1,50 @@
+//! The trained network in `models/nano`: the blob is the checkpoint converted, and commands without a model run it.
+
+mod common;
+
+use common::{ok, ok_json};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+fn s(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Checkpoint and blob; none before a model ships.
+fn shipped(test: &str) -> Option<(PathBuf, PathBuf)> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/nano");
+    let (checkpoint, blob) = (folder.join("nano.safetensors"), folder.join("nano.sfw"));
+    if !checkpoint.exists() && !blob.exists() {
+        println!("{test}: not run, models/nano holds no model");
+        return None;
+    }
+    Some((checkpoint, blob))
+}
+
+#[test]
+fn the_shipped_blob_is_the_converted_checkpoint() {
+    let Some((checkpoint, blob)) = shipped("the_shipped_blob_is_the_converted_checkpoint") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let again = dir.path().join("nano.sfw");
+    ok(&["convert", s(&checkpoint), "-o", s(&again), "--to", "f16"]);
+    assert!(
+        fs::read(&blob).unwrap() == fs::read(&again).unwrap(),
+        "models/nano/nano.sfw is another model than nano.safetensors: convert it again with --to f16"
+    );
+}
+
+#[test]
+fn a_command_without_a_model_runs_the_shipped_one() {
+    let Some((_, blob)) = shipped("a_command_without_a_model_runs_the_shipped_one") else { return };
+    let json = ok_json(&["eval", "--synth-heldout", "1"]);
+    assert_eq!(
+        (json["model"]["embedded"].as_bool(), json["model"]["random_weights"].as_bool()),
+        (Some(true), Some(false))
+    );
+    let file = ok_json(&["eval", "-m", s(&blob), "--synth-heldout", "1"]);
+    assert_eq!(json["model"]["digest"], file["model"]["digest"]);
+    assert_eq!(json["psnr_full_db"], file["psnr_full_db"]);
+    // It has learned what a street looks like: far nearer than the medians of other streets would be.
+    assert!(json["context_depth_absrel_scaled"].as_f64().unwrap() < 0.4, "{}", json["context_depth_absrel_scaled"]);
+    assert!(json["translation_error_ratio"].as_f64().unwrap() < 0.6, "{}", json["translation_error_ratio"]);
+}
