@@ -74,6 +74,12 @@ pub(crate) fn sources(clip: &Clip) -> Vec<FrameSource> {
     clip.frames.iter().map(|f| FrameSource { name: f.name.clone(), size: f.image.size() }).collect()
 }
 
+/// Which pixels of the context frames a network takes for sky; none where it has no confidence.
+pub(crate) fn sky(config: &ModelConfig, out: &Output) -> Option<Vec<bool>> {
+    let least = config.sky_conf as f32;
+    config.has_conf().then(|| out.conf.iter().map(|&c| sf_ops::activation::sigmoid(c) < least).collect())
+}
+
 /// What a session is and did, for reports.
 pub(crate) fn session_json(session: &Session) -> Value {
     let stages = session.stage_times().map(|s| json!({ "name": s.name, "ms": s.time.as_secs_f64() * 1e3 }));

@@ -26,7 +26,7 @@ use crate::reconstruct;
 use crate::results::Results;
 use crate::views::{self, Rig};
 use serde_json::json;
-use sf_eval::{EvalClip, EvalOptions, Protocol, evaluate};
+use sf_eval::{EvalClip, EvalOptions, Protocol, Subject, evaluate_subject};
 use sf_formats::atomic::{self, Overwrite};
 use sf_formats::camera_json::TimedCamera;
 use sf_formats::clip::{Clip, ClipOptions, GroundTruth, TruthFrame};
@@ -107,7 +107,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     atomic::write(&folder.path().join("street.html"), page.as_bytes(), Overwrite::Yes)?;
 
     let options = EvalOptions::new(protocol);
-    let scores = evaluate(&EvalClip::new(&clip, truth.as_ref()), &scene, &mut renderer, &options)?;
+    let sky = reconstruct::sky(config, out);
+    let subject = Subject { scene: &scene, depth: Some(&out.depth), sky: sky.as_deref() };
+    let scores = evaluate_subject(&EvalClip::new(&clip, truth.as_ref()), &subject, &mut renderer, &options)?;
     let random = loaded.random();
     let mut json = json!({
         "schema": "streetforward.demo/1",

@@ -201,11 +201,8 @@ impl Bench<'_> {
             }
             let out = session.output();
             let scene = out.to_scene(&config, &reconstruct::sources(&context));
-            // `static.voxel` leaves no Gaussian per pixel, so the depth is the network's own.
-            let least = config.sky_conf as f32;
-            let sky: Vec<bool> = out.conf.iter().map(|&c| sf_ops::activation::sigmoid(c) < least).collect();
-            let sky = (!sky.is_empty()).then_some(&sky[..]);
-            let subject = Subject { scene: &scene, depth: Some(&out.depth), sky };
+            let sky = reconstruct::sky(&config, out);
+            let subject = Subject { scene: &scene, depth: Some(&out.depth), sky: sky.as_deref() };
             match &mut report {
                 None => {
                     let mut first = evaluate_subject(&pairs, &subject, &mut self.renderer, &options)?;
