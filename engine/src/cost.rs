@@ -9,11 +9,13 @@ use crate::aggregator::is_global;
 use crate::causal;
 use crate::dims::{ClipShape, Dims};
 use crate::heads::dpt;
+use crate::model::Model;
 use crate::motion::Reach;
 use crate::probe::STAGES;
 use sf_formats::Result;
 use sf_formats::arch::{self, Role};
-use sf_formats::config::{Head, HeadKind, ModelConfig};
+use sf_formats::blob::Dtype;
+use sf_formats::config::ModelConfig;
 use sf_ops::attention::FrameMask;
 
 /// Multiply-adds of one stage.
@@ -27,6 +29,8 @@ pub struct StageCost {
     pub conv: u64,
     /// In attention.
     pub attention: u64,
+    /// Those of them that run in int8.
+    pub int8: u64,
 }
 
 impl StageCost {
@@ -54,24 +58,44 @@ pub struct Cost {
 }
 
 impl Cost {
-    /// Of a clip through the network of `config`; errors as [`Plan::new`](crate::Plan::new) for shapes that do not
-    /// fit it.
+    /// Of a clip through the network of `config`, in floats; errors as [`Plan::new`](crate::Plan::new) for shapes
+    /// that do not fit it.
     pub fn of(config: &ModelConfig, shape: ClipShape) -> Result<Cost> {
+        Self::count(config, shape, &|_| false)
+    }
+
+    /// Of a clip through a model, whose weights tell what runs in int8.
+    pub fn of_model(model: &Model, shape: ClipShape) -> Result<Cost> {
+        let blob = model.blob();
+        let int8 = |name: &str| blob.find(name).is_some_and(|i| blob.tensors()[i].dtype == Dtype::Int8);
+        Self::count(model.config(), shape, &int8)
+    }
+
+    fn count(config: &ModelConfig, shape: ClipShape, int8: &dyn Fn(&str) -> bool) -> Result<Cost> {
         let d = Dims::new(config, shape)?;
-        let mut cost = Cost { stages: STAGES.map(|name| StageCost { name, gemm: 0, conv: 0, attention: 0 }) };
+        let stage = |name| StageCost { name, gemm: 0, conv: 0, attention: 0, int8: 0 };
+        let mut cost = Cost { stages: STAGES.map(stage) };
         for tensor in arch::tensors(config) {
+            let name = &tensor.name;
             let Some((n, k)) = tensor.matrix() else { continue };
-            let (stage, rows) = rows(config, &d, &tensor.name);
+            let (stage, rows) = rows(config, &d, name);
+            let stage = cost.stages.iter_mut().find(|s| s.name == stage).expect("a stage of the clock");
             let macs = (rows * n * k) as u64;
-            let stage = cost.stage_mut(stage);
             // The 1x1 convolutions on a pyramid's taps are products over tokens.
-            if tensor.role == Role::Linear || tensor.name.contains("_head.projects.") {
+            if tensor.role == Role::Linear || name.contains("_head.projects.") {
                 stage.gemm += macs;
             } else {
                 stage.conv += macs;
             }
+            stage.int8 += if int8(name) { macs } else { 0 };
+            if let Some(block) = name.strip_suffix(".attn.qkv.weight") {
+                let macs = masks(config, &d, name).iter().map(products).sum::<u64>() * k as u64;
+                stage.attention += macs;
+                // As the layers around it.
+                let both = int8(name) && int8(&format!("{block}.attn.proj.weight"));
+                stage.int8 += if both { macs } else { 0 };
+            }
         }
-        cost.attention(config, &d);
         Ok(cost)
     }
 
@@ -85,29 +109,9 @@ impl Cost {
         self.stages.iter().map(StageCost::macs).sum()
     }
 
-    fn stage_mut(&mut self, name: &str) -> &mut StageCost {
-        self.stages.iter_mut().find(|s| s.name == name).expect("a stage of the clock")
-    }
-
-    fn attention(&mut self, c: &ModelConfig, d: &Dims) {
-        let mut add = |stage: &str, mask: FrameMask, dim: u32, layers: u32| {
-            self.stage_mut(stage).attention += products(&mask) * u64::from(dim) * u64::from(layers);
-        };
-        add("encoder", d.frame_mask(d.encoder_tokens), c.encoder.dim, c.encoder.depth);
-        for i in 0..c.aa.depth as usize {
-            let mask = if is_global(c, i) { d.global_mask() } else { d.frame_mask(d.tokens) };
-            add(aa_stage(c, i), mask, c.aa.dim, 1);
-        }
-        let frame = d.frame_mask(d.tokens);
-        add("camera", frame, c.camera_dim, c.camera_depth);
-        let layers = |h: &Head| if matches!(h.kind, HeadKind::XdecLinear | HeadKind::Guided) { h.depth } else { 0 };
-        for (stage, head) in [("depth", &c.depth), ("conf", &c.conf), ("gaussians", &c.gs)] {
-            add(stage, frame, head.dim, layers(head));
-        }
-        for reach in passes(c, d) {
-            add("causal", causal::mask(c, d, reach), c.causal_dim(), c.causal_depth);
-            add("motion", d.frame_mask(d.patches), c.motion.dim, layers(&c.motion));
-        }
+    /// Those of them that run in int8.
+    pub fn int8(&self) -> u64 {
+        self.stages.iter().map(|s| s.int8).sum()
     }
 }
 
@@ -131,6 +135,31 @@ fn passes(config: &ModelConfig, d: &Dims) -> Vec<Reach> {
     [Some(first), second].into_iter().flatten().collect()
 }
 
+/// What the queries of a block see, once for every time that it runs; `name` is a tensor of the block.
+fn masks(c: &ModelConfig, d: &Dims, name: &str) -> Vec<FrameMask> {
+    let part = name.split('.').next().unwrap_or_default();
+    let passes = passes(c, d);
+    match part {
+        "encoder" => vec![d.frame_mask(d.encoder_tokens)],
+        "decoder" if is_global(c, layer(name)) => vec![d.global_mask()],
+        "motion_decoder" => vec![d.frame_mask(d.patches); passes.len()],
+        "causal" | "causal_back" => {
+            let run = match (part, c.causal_share) {
+                ("causal", true) => &passes[..],
+                ("causal", false) => &passes[..passes.len().min(1)],
+                _ => &passes[passes.len().min(1)..],
+            };
+            run.iter().map(|&reach| causal::mask(c, d, reach)).collect()
+        }
+        _ => vec![d.frame_mask(d.tokens)],
+    }
+}
+
+/// Number of an aggregator layer, `decoder.{i}`.
+fn layer(name: &str) -> usize {
+    name.split('.').nth(1).and_then(|i| i.parse().ok()).expect("a layer's number")
+}
+
 /// Stage of a weight matrix, and the rows that go through it in a run.
 fn rows(c: &ModelConfig, d: &Dims, name: &str) -> (&'static str, usize) {
     let f = d.frames;
@@ -141,10 +170,7 @@ fn rows(c: &ModelConfig, d: &Dims, name: &str) -> (&'static str, usize) {
         "image_stem" => ("preprocess", f * d.pixels() / 4),
         "encoder" => ("encoder", f * d.encoder_tokens),
         "aa_time" => (aa_stage(c, 0), f),
-        "decoder" => {
-            let layer = rest.split('.').next().and_then(|i| i.parse().ok()).expect("a layer's number");
-            (aa_stage(c, layer), f * d.tokens)
-        }
+        "decoder" => (aa_stage(c, layer(name)), f * d.tokens),
         "camera_decoder" => ("camera", f * d.tokens),
         "camera_head" if rest.starts_with("res_conv") => ("camera", f * d.patches),
         "camera_head" => ("camera", f),
@@ -197,7 +223,7 @@ fn head_rows(d: &Dims, rest: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use sf_formats::config::{MotionLayout, Trunk};
+    use sf_formats::config::{Head, HeadKind, MotionLayout, Trunk};
 
     /// Frame sizes of the network specification's table 5.2.
     const SIZES: [(usize, usize); 3] = [(168, 252), (280, 518), (378, 518)];

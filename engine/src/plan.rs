@@ -143,8 +143,9 @@ impl Plan {
 
     /// Bytes of the arena's areas by name.
     pub fn areas_bytes(&self) -> Vec<(&'static str, u64)> {
-        let names = ["pairs", "guide", "motion", "work"];
-        names.into_iter().zip(self.areas).map(|(name, values)| (name, 4 * values as u64)).collect()
+        let [pairs, guide, motion, work] = self.areas;
+        let areas = [("pairs", pairs), ("guide", guide), ("motion", motion), ("work", work), ("rows", self.rows)];
+        areas.into_iter().map(|(name, values)| (name, 4 * values as u64)).collect()
     }
 
     /// Bytes of working memory that each stage asks for; the area holds the largest.

@@ -183,7 +183,7 @@ fn run(ctx: Ctx, x: Hwc, conv: &ConvS8, out: &Out) {
     if shape.oh * shape.ow * weight.n == 0 {
         return;
     }
-    let _span = opclock::span(Op::Conv, || {
+    let _span = opclock::span(Op::ConvS8, || {
         let pixels = shape.oh * shape.ow;
         let bytes = weight.data.len() + 4 * (x.h * x.w * x.c + pixels * weight.n);
         Work { macs: (pixels * weight.n * weight.k) as u64, bytes: bytes as u64 }

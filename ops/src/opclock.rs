@@ -21,6 +21,8 @@ pub enum Op {
     AttentionS8,
     /// Convolutions and transposed convolutions.
     Conv,
+    /// The same with int8 weights.
+    ConvS8,
     /// Layer norms, query and key norms with the rotary embedding.
     Norm,
     /// Rotation and quantization of rows to bytes.
@@ -35,12 +37,13 @@ pub enum Op {
 
 impl Op {
     /// Every kind, in the order of an account.
-    pub const ALL: [Op; 10] = [
+    pub const ALL: [Op; 11] = [
         Op::Gemm,
         Op::GemmS8,
         Op::Attention,
         Op::AttentionS8,
         Op::Conv,
+        Op::ConvS8,
         Op::Norm,
         Op::Quantize,
         Op::Resize,
@@ -56,6 +59,7 @@ impl Op {
             Op::Attention => "attention",
             Op::AttentionS8 => "attention_s8",
             Op::Conv => "conv",
+            Op::ConvS8 => "conv_s8",
             Op::Norm => "norm",
             Op::Quantize => "quantize",
             Op::Resize => "resize",
