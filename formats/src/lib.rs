@@ -23,6 +23,7 @@
 //! | `clip.rs` | [`clip::Clip`]: frames, times, intrinsics, reference poses |
 //! | `clip_source.rs`, `transforms.rs` | what a path holds: folders, lists, `transforms.json` |
 //! | `truth.rs` | [`clip::GroundTruth`]; clips as folders with it |
+//! | `y4m_in.rs` | [`y4m_in::Y4mReader`]: uncompressed video through a pipe |
 //! | `image_io.rs`, `npy.rs` | PNG and JPEG pictures, NumPy arrays |
 //! | `picture.rs`, `label.rs` | depth, velocity and other numbers as pictures with a known scale; small text |
 //! | `scene_io.rs`, `ply.rs` | [`Scene::save`], [`Scene::load`]; splats as PLY and PLY sequences |
@@ -77,6 +78,7 @@ mod torch_in;
 pub mod transforms;
 mod truth;
 pub mod y4m;
+pub mod y4m_in;
 
 pub use blob::{Blob, Dtype, Layout, LoadMode, TensorRecord, Verify};
 pub use blob_writer::BlobWriter;
