@@ -20,15 +20,19 @@
 //! | `video.rs` | animated PNG, y4m, mp4 |
 //! | `html.rs`, `assets/viewer/` | a scene as one page for a browser |
 //! | `report.rs` | results as tables and charts on one page |
+//! | `machine.rs` | processor, memory, load, clock, measured peaks |
+//! | `bench/` | what `bench` is made of |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
 //! | `verbs/` | one file per verb |
 #![deny(unsafe_code)]
 
 mod args;
+mod bench;
 mod exit;
 mod folder;
 mod golden;
 mod html;
+mod machine;
 mod model;
 mod network;
 mod output;
@@ -102,6 +106,7 @@ mod tests {
         for (name, text) in [
             ("README.md", include_str!("../../README.md")),
             ("docs/pictures.md", include_str!("../../docs/pictures.md")),
+            ("docs/measuring.md", include_str!("../../docs/measuring.md")),
             ("tests/data/drive/README.md", include_str!("../../tests/data/drive/README.md")),
         ] {
             let list = commands(text);

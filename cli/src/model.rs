@@ -5,9 +5,11 @@ use crate::args::{EngineArgs, Precision};
 use crate::network::Watched;
 use crate::output::Console;
 use crate::signals;
+use clap::ValueEnum;
 use serde_json::{Value, json};
 use sf_formats::atomic::Overwrite;
 use sf_formats::blob::{Blob, LoadMode, Verify};
+use sf_formats::checkpoint::Checkpoint;
 use sf_formats::digest::hex;
 use sf_formats::error::escape_path;
 use sf_formats::sniff::FileKind;
@@ -48,6 +50,21 @@ pub(crate) struct Loaded {
 }
 
 impl Loaded {
+    /// Milliseconds from the file to a model that is ready, its digests verified.
+    pub(crate) fn load_ms(&self) -> f64 {
+        self.load_ms
+    }
+
+    /// Precision of most of its bytes; a blob may keep some of its tensors in another.
+    pub(crate) fn precision(&self) -> Option<Precision> {
+        let blob = self.model.blob();
+        let bytes = |p: &Precision| -> usize {
+            let tensors = blob.tensors().iter().enumerate();
+            tensors.filter(|(_, t)| t.dtype == p.dtype()).map(|(i, _)| blob.bytes(i).len()).sum()
+        };
+        Precision::value_variants().iter().max_by_key(|p| bytes(p)).copied()
+    }
+
     /// For reports.
     pub(crate) fn json(&self) -> Value {
         json!({
@@ -100,6 +117,13 @@ pub(crate) fn load(path: Option<&Path>, engine: &EngineArgs, to: Precision, cons
     Ok(Loaded { model, origin, load_ms: start.elapsed().as_secs_f64() * 1e3 })
 }
 
+/// The random network of a configuration, always from the same seed, as a blob that is mapped like a file's.
+pub(crate) fn random(config: &ModelConfig, to: Precision, console: &Console) -> Result<Loaded> {
+    let seeded = Seeded::new(config, RANDOM_SEED, Outputs::Random)?;
+    let (blob, load_ms) = temporary(&seeded, to, "weights", console)?;
+    Ok(Loaded { model: Arc::new(Model::from_blob(blob)?), origin: Origin::Random, load_ms })
+}
+
 /// Whether a path holds a checkpoint; everything else is left to the blob reader and its messages.
 fn is_checkpoint(path: &Path) -> Result<bool> {
     let meta = std::fs::metadata(path).map_err(|e| Error::io(path, "open", &e))?;
@@ -115,14 +139,21 @@ fn from_checkpoint(path: &Path, to: Precision, console: &Console) -> Result<Blob
     let shown = escape_path(path);
     console.note(format!("{shown} is a checkpoint: converting it to {} for this run", to.dtype().name()));
     let source = checkpoint::open(&[path.to_path_buf()])?;
+    temporary(&*source, to, "convert", console).map(|(blob, _)| blob)
+}
+
+/// Converts into a temporary file that is gone when the blob is open; also gives the milliseconds that opening took.
+fn temporary(source: &dyn Checkpoint, to: Precision, what: &'static str, console: &Console) -> Result<(Blob, f64)> {
     let folder = scratch_folder()?;
     let file = folder.0.join("model.sfw");
-    let progress = console.progress(source.tensors().len() as u64, "convert");
-    let watched = Watched::new(&*source, &progress);
+    let progress = console.progress(source.tensors().len() as u64, what);
+    let watched = Watched::new(source, &progress);
     convert(&watched, &file, Overwrite::No, &Options::to(to.dtype()))?;
     drop(progress);
+    let start = Instant::now();
     // The mapping keeps the unlinked file; nobody else can reach it any more.
-    Blob::open(&file, LoadMode::Map, Verify::Structure)
+    let blob = Blob::open(&file, LoadMode::Map, Verify::Digests)?;
+    Ok((blob, start.elapsed().as_secs_f64() * 1e3))
 }
 
 /// A private temporary folder, deleted when dropped.

@@ -54,10 +54,15 @@ impl NetworkArgs {
             Some(file) => read_config(file)?,
             None => preset(self.preset),
         };
-        Ok(match self.heads {
-            Some(Heads::Linear) => config.with_linear_heads(),
-            Some(Heads::Own) | None => config,
-        })
+        Ok(with_heads(config, self.heads))
+    }
+}
+
+/// The network with heads of the kind asked for.
+pub(crate) fn with_heads(config: ModelConfig, heads: Option<Heads>) -> ModelConfig {
+    match heads {
+        Some(Heads::Linear) => config.with_linear_heads(),
+        Some(Heads::Own) | None => config,
     }
 }
 

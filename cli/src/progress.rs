@@ -24,6 +24,11 @@ impl Progress {
         Progress(bar)
     }
 
+    /// So many steps done.
+    pub(crate) fn set(&self, done: u64) {
+        self.0.set_position(done);
+    }
+
     /// One step done.
     pub(crate) fn step(&self) {
         self.0.inc(1);

@@ -28,10 +28,14 @@ pub(crate) fn context_clip(clip: &Clip, protocol: &Protocol) -> Clip {
 /// Size at which a network sees a clip: as asked; or of as many pixels as it was trained with; or that of its
 /// pictures in whole patches, shrunk to the pixels its position table was made for (and Pi3's limit).
 pub(crate) fn network_size(config: &ModelConfig, clip: &Clip, asked: Option<Size>) -> (u32, u32) {
+    size_for(config, clip.frames[0].image.size(), asked)
+}
+
+/// [`network_size`] for pictures of `w` x `h`.
+pub(crate) fn size_for(config: &ModelConfig, (w, h): (u32, u32), asked: Option<Size>) -> (u32, u32) {
     if let Some(size) = asked {
         return (size.width, size.height);
     }
-    let (w, h) = clip.frames[0].image.size();
     if let Some([tw, th]) = config.image_size {
         return fit_size(w, h, config.patch, u64::from(tw) * u64::from(th));
     }
@@ -113,11 +117,4 @@ pub(crate) fn output_digest(out: &Output) -> Digest {
     });
     all.extend(sha256(&cameras.flat_map(f64::to_le_bytes).collect::<Vec<u8>>()));
     sha256(&all)
-}
-
-/// Most memory this process has held, bytes; none where the system does not tell.
-pub(crate) fn peak_rss_bytes() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
-    line.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
 }

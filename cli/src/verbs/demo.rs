@@ -19,6 +19,7 @@
 use crate::args::{EngineArgs, FolderArgs, Precision, Shift, path_json};
 use crate::folder::OutputFolder;
 use crate::html;
+use crate::machine;
 use crate::model;
 use crate::output::{Console, files_json, human_count, json_text};
 use crate::overview::overview;
@@ -122,7 +123,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         "first_ms": first_ms,
         "run_ms": run_ms,
         "render_ms": render_ms,
-        "peak_rss_bytes": reconstruct::peak_rss_bytes(),
+        "peak_rss_bytes": machine::peak_rss_bytes(),
         "gaussians": scene.len(),
         "eval": scores.to_json(),
     });

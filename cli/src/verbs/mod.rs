@@ -1,5 +1,6 @@
 //! One file per verb; each has its arguments and a `run` that joins the crates.
 
+mod bench;
 mod compare;
 mod convert;
 mod demo;
@@ -8,6 +9,7 @@ mod eval;
 mod export;
 mod init;
 mod inspect;
+mod plan;
 mod render;
 mod report;
 mod run;
@@ -42,6 +44,10 @@ pub(crate) enum Verb {
     Eval(eval::Args),
     /// Measure what one model predicts against another, as int8 against f32
     Compare(compare::Args),
+    /// Measure how long the network takes here
+    Bench(bench::Args),
+    /// Tell what a clip needs in memory and time, before it runs
+    Plan(plan::Args),
     /// Write a synthetic street clip with exact ground truth
     Synth(synth::Args),
     /// Describe this machine: processor, memory, threads, chosen kernels
@@ -63,6 +69,8 @@ impl Verb {
             Verb::Verify(args) => verify::run(args, console),
             Verb::Eval(args) => eval::run(args, console),
             Verb::Compare(args) => compare::run(args, console),
+            Verb::Bench(args) => bench::run(args, console),
+            Verb::Plan(args) => plan::run(args, console),
             Verb::Synth(args) => synth::run(args, console),
             Verb::Doctor(args) => doctor::run(args, console),
         }

@@ -2,6 +2,7 @@
 
 use crate::args::{ClipArgs, EngineArgs, FolderArgs, Precision, Size, path_json};
 use crate::folder::OutputFolder;
+use crate::machine;
 use crate::model;
 use crate::output::{Console, files_json, human_count, json_text};
 use crate::reconstruct;
@@ -149,7 +150,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         "session": reconstruct::session_json(&session),
         "clip_ms": clip_ms,
         "run_ms": run_ms,
-        "peak_rss_bytes": reconstruct::peak_rss_bytes(),
+        "peak_rss_bytes": machine::peak_rss_bytes(),
         "gaussians": scene.len(),
         "no_motion": out.flags.no_motion,
         "intrinsics_assumed": out.flags.intrinsics_assumed,
