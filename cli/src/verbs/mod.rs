@@ -13,6 +13,7 @@ mod plan;
 mod render;
 mod report;
 mod run;
+mod stream;
 mod synth;
 mod verify;
 
@@ -48,6 +49,8 @@ pub(crate) enum Verb {
     Bench(bench::Args),
     /// Tell what a clip needs in memory and time, before it runs
     Plan(plan::Args),
+    /// Turn pictures into poses, depth and scenes as they come
+    Stream(stream::Args),
     /// Write a synthetic street clip with exact ground truth
     Synth(synth::Args),
     /// Describe this machine: processor, memory, threads, chosen kernels
@@ -71,6 +74,7 @@ impl Verb {
             Verb::Compare(args) => compare::run(args, console),
             Verb::Bench(args) => bench::run(args, console),
             Verb::Plan(args) => plan::run(args, console),
+            Verb::Stream(args) => stream::run(args, console),
             Verb::Synth(args) => synth::run(args, console),
             Verb::Doctor(args) => doctor::run(args, console),
         }
