@@ -243,12 +243,12 @@ pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut)
     }
     let add = residual.map_or(AddTo::Nothing, |r| AddTo::Other(r.as_mat()));
     let sink = RowSink { out: SharedMut::new(out.data), stride: weight.n, add };
+    let _span = opclock::span(Op::Conv, || Work::product(oh * ow, &weight, x.h * x.w * x.c));
     if kernel > stride {
         return overlapping(ctx, x, conv, &sink);
     }
     let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
     let (bias, act) = (conv.bias, conv.act);
-    let _span = opclock::span(Op::Conv, || Work::product(oh * ow, &weight, x.h * x.w * x.c));
     product(ctx, &Product { m: oh * ow, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
 }
 
