@@ -36,13 +36,14 @@ fn the_shipped_blob_is_the_converted_checkpoint() {
 #[test]
 fn a_command_without_a_model_runs_the_shipped_one() {
     let Some((_, blob)) = shipped("a_command_without_a_model_runs_the_shipped_one") else { return };
-    // The size it was trained at; at the pictures' own 252x168 its depth is off by half.
-    let json = ok_json(&["eval", "--synth-heldout", "1", "--size", "168x112"]);
+    // At the size it was trained at, which its configuration tells; at 252x168 its depth is off by half.
+    let json = ok_json(&["eval", "--synth-heldout", "1"]);
+    assert_eq!(json["data"][0]["size"], serde_json::json!([168, 112]));
     assert_eq!(
         (json["model"]["embedded"].as_bool(), json["model"]["random_weights"].as_bool()),
         (Some(true), Some(false))
     );
-    let file = ok_json(&["eval", "-m", s(&blob), "--synth-heldout", "1", "--size", "168x112"]);
+    let file = ok_json(&["eval", "-m", s(&blob), "--synth-heldout", "1"]);
     assert_eq!(json["model"]["digest"], file["model"]["digest"]);
     assert_eq!(json["psnr_full_db"], file["psnr_full_db"]);
     // It has learned what a street looks like: far nearer than the medians of other streets would be.

@@ -190,6 +190,7 @@ impl Bench<'_> {
         let size = reconstruct::network_size(config, &context, self.args.size);
         let prepared = reconstruct::prepare_clip(config, &context, None, size)?;
         self.make_sessions(&prepared)?;
+        entry["size"] = json!([size.0, size.1]);
         let pairs = EvalClip::new(clip, truth);
         let mut report = None;
         for (session, method) in self.sessions.iter_mut().zip([Method::Model, Method::NoCausal]) {
