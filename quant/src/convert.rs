@@ -1,7 +1,7 @@
 //! Checkpoint to weight blob, one tensor in memory at a time.
 //!
 //! Matrices become f32, f16 or int8 panels, everything else f32. Which matrix gets which type is decided in
-//! [`crate::recipe`]; a matrix with a value beyond the range of f16 becomes f32 instead, and one whose int8 weights
+//! `recipe.rs`; a matrix with a value beyond the range of f16 becomes f32 instead, and one whose int8 weights
 //! do not reach [`WEIGHT_FLOOR_DB`] becomes f16.
 
 use crate::detect::detect;

@@ -1,7 +1,7 @@
 //! One matrix to int8: folded, rotated, scaled and rounded in f64, row by row.
 //!
 //! Row o of the stored matrix is round(w / s), w = R (gamma_o * W_o * gain), s the step that gives the smallest
-//! squared error ([`best_scale`]). Rounding is to nearest, ties to even; values stay in [-127, 127].
+//! squared error (`best_scale`). Rounding is to nearest, ties to even; values stay in [-127, 127].
 
 use crate::rng::Stream;
 use rayon::prelude::*;
