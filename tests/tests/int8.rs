@@ -9,6 +9,8 @@ use sf_quant::Options;
 use sf_tests::int8::{adversarial, blob, converted, relative_error, shallow, tiny};
 use sf_tests::tiny::{Frames, Tensors, stages, tensors};
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
 use streetforward::reference::{self, Weights};
 use streetforward::{Model, Options as Run, Session};
 
@@ -107,6 +109,22 @@ fn bits(model: &Arc<Model>, clip: &Frames, isa: Isa, threads: usize) -> Vec<u32>
         first = all;
     }
     first
+}
+
+/// Cancelled and late runs end with status 8, and leave nothing behind.
+#[test]
+fn runs_can_be_stopped() {
+    let config = tiny();
+    let model = converted(&config, &tensors(&config, 5), Options::to(Dtype::Int8));
+    let clip = Frames::new(2, 28, 42, 6);
+    let mut session = Session::new(Arc::clone(&model), clip.shape, Run::default()).unwrap();
+    let want = session.run(&clip.input()).unwrap().clone();
+    session.cancel_flag().store(true, Ordering::Relaxed);
+    assert_eq!(session.run(&clip.input()).unwrap_err().status() as i32, 8);
+    session.cancel_flag().store(false, Ordering::Relaxed);
+    let past = Some(Instant::now());
+    assert_eq!(session.run_watched(&clip.input(), past, None).unwrap_err().status() as i32, 8);
+    assert!(*session.run(&clip.input()).unwrap() == want);
 }
 
 #[test]
