@@ -7,6 +7,7 @@
 use sf_formats::blob::{Blob, Dtype, LoadMode, Verify};
 use sf_formats::config::{Head, HeadKind, KSource, ModelConfig, RcuSkip, Trunk};
 use sf_formats::{Error, Result};
+use sf_ops::gemm::s8::pack::QUAD;
 use sf_ops::gemm::{PanelData, Panels, PanelsS8};
 use sf_ops::hadamard::Rotation;
 use sf_ops::simd::LANES;
@@ -293,7 +294,7 @@ impl Model {
         (d.is_multiple_of(LANES) && signs.len() >= d / LANES).then(|| Rotation::new(d, &signs[..d / LANES]))
     }
 
-    /// The panels behind the handle of a convolution, which is never int8.
+    /// The panels behind the handle of a convolution that reads the image, which is never int8.
     pub(crate) fn panels(&self, r: &PanelRef) -> Panels<'_> {
         match self.weight(r) {
             Weight::Float(panels) => panels,
@@ -331,11 +332,13 @@ impl Lookup<'_> {
         Ok(PanelRef { tensor, dtype: record.dtype, n, k })
     }
 
-    /// Panels of a convolution with a window, or one that runs as such.
-    fn conv_panels(&self, name: &str, n: usize, k: usize) -> Result<PanelRef> {
-        let panels = self.panels(name, n, k)?;
-        if panels.is_int8() {
-            return Err(Error::unsupported(name, "a convolution in int8: convert it to f16"));
+    /// Panels of a convolution: int8 ones are not rotated, and have whole quads of channels, as those that read the
+    /// image have not.
+    fn conv_panels(&self, name: &str, n: usize, (area, inputs): (usize, usize)) -> Result<PanelRef> {
+        let panels = self.panels(name, n, area * inputs)?;
+        if panels.is_int8() && (!self.blob.int8(panels.tensor).signs.is_empty() || !inputs.is_multiple_of(QUAD)) {
+            let why = format!("an int8 convolution over {inputs} channels, not in fours or rotated: convert it again");
+            return Err(Error::unsupported(name, why));
         }
         Ok(panels)
     }
@@ -355,7 +358,7 @@ impl Lookup<'_> {
     }
 
     fn conv(&self, name: &str, out: usize, inputs: usize, kernel: usize) -> Result<Linear> {
-        let weight = self.conv_panels(&format!("{name}.weight"), out, kernel * kernel * inputs)?;
+        let weight = self.conv_panels(&format!("{name}.weight"), out, (kernel * kernel, inputs))?;
         Ok(Linear { weight, bias: Some(self.values(&format!("{name}.bias"), out)?) })
     }
 
@@ -434,12 +437,12 @@ impl Lookup<'_> {
         // 1x1 convolutions that run as linear layers.
         let project = |i: usize| self.linear(&format!("{p}.projects.{i}"), channels[i], inputs);
         let lateral = |i: usize| -> Result<Linear> {
-            let weight = self.conv_panels(&format!("{s}.layer{}_rn.weight", i + 1), f, 9 * channels[i])?;
+            let weight = self.conv_panels(&format!("{s}.layer{}_rn.weight", i + 1), f, (9, channels[i]))?;
             Ok(Linear { weight, bias: None })
         };
         let up = |i: usize, k: usize| -> Result<Linear> {
             let c = channels[i];
-            let weight = self.conv_panels(&format!("{p}.resize_layers.{i}.weight"), k * k * c, c)?;
+            let weight = self.conv_panels(&format!("{p}.resize_layers.{i}.weight"), k * k * c, (1, c))?;
             Ok(Linear { weight, bias: Some(self.values(&format!("{p}.resize_layers.{i}.bias"), c)?) })
         };
         let (hidden, out) = (h.hidden as usize, h.out as usize);

@@ -1,15 +1,18 @@
-//! [`Net`]: weights, the machine to run them on, and the linear layers of every precision.
+//! [`Net`]: weights, the machine to run them on, and the linear layers and convolutions of every precision.
 //!
 //! An int8 layer quantizes its input rows (per token, after the norm in front and the rotation, in one pass) into
-//! [`Rows`], then multiplies. One layer runs at a time, so one area serves all of them.
+//! [`Rows`], then multiplies. One layer runs at a time, so one area serves all of them. An int8 convolution quantizes its
+//! map band by band, in the pool's own memory.
 
 use crate::arena::Arena;
 use crate::model::{Linear, Model, Norm, PanelRef, VecRef, Weight};
 use sf_formats::Result;
+use sf_ops::conv::{self, Conv, ConvTranspose};
+use sf_ops::conv_s8::{self, ConvS8, ConvTransposeS8};
 use sf_ops::cpu::Ctx;
 use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, padded_k};
 use sf_ops::hadamard::Rotation;
-use sf_ops::mat::{Mat, MatMut};
+use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
 use sf_ops::quantize::{self, Before, quantize};
 use std::cell::RefCell;
 
@@ -42,7 +45,53 @@ pub(crate) struct Net<'a> {
     pub(crate) rows: &'a Rows,
 }
 
+/// A convolution with its surroundings.
+#[derive(Clone, Copy)]
+pub(crate) struct ConvLayer<'a> {
+    pub(crate) weights: &'a Linear,
+    pub(crate) kernel: usize,
+    pub(crate) stride: usize,
+    pub(crate) act: Act,
+    pub(crate) relu_input: Act,
+}
+
+impl<'a> ConvLayer<'a> {
+    /// Stride 1, nothing before or after.
+    pub(crate) fn same(weights: &'a Linear, kernel: usize) -> ConvLayer<'a> {
+        ConvLayer { weights, kernel, stride: 1, act: Act::None, relu_input: Act::None }
+    }
+}
+
 impl Net<'_> {
+    /// out = act(conv(x)) + residual, padded by half the kernel.
+    pub(crate) fn conv(&self, layer: ConvLayer, x: Hwc, residual: Option<Hwc>, out: HwcMut) {
+        let ConvLayer { weights, kernel, stride, act, relu_input } = layer;
+        let bias = weights.bias.map(|b| self.model.values(b));
+        let pad = kernel / 2;
+        match self.model.weight(&weights.weight) {
+            Weight::Float(weight) => {
+                conv::conv2d(self.ctx, x, &Conv { weight, bias, kernel, stride, pad, relu_input, act }, residual, out);
+            }
+            Weight::Int8(weight, _) => {
+                let conv = ConvS8 { weight, bias, kernel, stride, pad, relu_input, act, relu_sum: false };
+                conv_s8::conv2d_s8(self.ctx, x, &conv, residual, out);
+            }
+        }
+    }
+
+    /// Transposed convolution with stride = kernel.
+    pub(crate) fn up(&self, weights: &Linear, kernel: usize, x: Hwc, out: HwcMut) {
+        let bias = weights.bias.map(|b| self.model.values(b));
+        match self.model.weight(&weights.weight) {
+            Weight::Float(weight) => {
+                conv::conv_transpose(self.ctx, x, &ConvTranspose { weight, bias, kernel }, out);
+            }
+            Weight::Int8(weight, _) => {
+                conv_s8::conv_transpose_s8(self.ctx, x, &ConvTransposeS8 { weight, bias, kernel }, out);
+            }
+        }
+    }
+
     /// out = act(x W^T + b).
     pub(crate) fn linear(&self, l: &Linear, act: Act, x: Mat, out: MatMut) {
         self.layer(l, None, x, Epilogue { act, ..Epilogue::default() }, out);

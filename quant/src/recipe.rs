@@ -4,8 +4,9 @@
 //! |---|---|---|---|
 //! | camera head; last layer of every head | f32 | f32 | tiny, and their errors reach poses, log depth and velocities unweakened |
 //! | patch embedding, time embedding | f16 | f16 | inputs of 588 and d_t values that no norm precedes; under 1 % of the work |
+//! | first convolution of a guided depth head | f16 | f16 | reads features beside the image, of very different sizes under one scale: 3 dB of the render |
 //! | input width that is no multiple of 16 | f16 | f16 | has no rotation |
-//! | convolutions | f16 | f16 | their int8 form does not exist |
+//! | convolutions over channels that are no multiple of 4 | f16 | f16 | have no int8 form |
 //! | everything else | f16 | int8 | |
 //!
 //! Folding ([`Sources`]) concerns int8 matrices: a norm's gain and offset go into every matrix that reads it when all
@@ -16,7 +17,7 @@ use crate::convert::SCAN_REASON;
 use crate::names::glob;
 use crate::seeded::output_layer;
 use sf_formats::arch::{Role, TensorSpec};
-use sf_formats::panel_s8::{Int8Layout, rotated_width, rotation_block};
+use sf_formats::panel_s8::{Int8Layout, QUAD, rotated_width, rotation_block};
 use sf_formats::{Dtype, ModelConfig};
 use std::collections::BTreeMap;
 
@@ -65,6 +66,9 @@ pub(crate) fn choose(
     if asked != Dtype::Int8 {
         return plain(asked);
     }
+    if spec.name == "point_head.conv.0.weight" {
+        return because(Dtype::F16, "reads features beside the image for the depth");
+    }
     let sensitive = [
         ("encoder.patch_embed.", "patch embedding"),
         ("image_stem.", "reads the image"),
@@ -92,7 +96,8 @@ pub(crate) fn is_rotated(spec: &TensorSpec) -> bool {
 /// Why a matrix cannot be int8.
 fn unfit(spec: &TensorSpec) -> Option<&'static str> {
     if !is_linear(spec) {
-        return Some("convolution");
+        let quads = rotated_width(spec)?.is_multiple_of(QUAD);
+        return (!quads).then_some("convolution over channels that are no multiple of 4");
     }
     let width = rotated_width(spec)?;
     let fits = rotation_block(width).is_some() && Int8Layout::of(spec, true).is_some();

@@ -68,6 +68,13 @@ pub fn tiny() -> ModelConfig {
     ModelConfig { time_dim: 16, ..crate::tiny::tiny() }
 }
 
+/// [`crate::tiny::tiny_guided`] with channels in fours, so that its convolutions are int8, too.
+pub fn guided() -> ModelConfig {
+    let head = |out| Head::guided(out, (16, 1, 2), 8, 12);
+    let tiny = crate::tiny::tiny_guided();
+    ModelConfig { guide_channels: 4, depth: head(2), gs: head(11), motion: head(4), time_dim: 16, ..tiny }
+}
+
 /// A network of a preset's widths but few layers, with linear heads.
 pub fn shallow(of: ModelConfig, encoder: u32, aa: u32) -> ModelConfig {
     let linear = |head: &Head| {

@@ -6,7 +6,7 @@ use sf_formats::ModelConfig;
 use sf_formats::arch;
 use sf_ops::cpu::Isa;
 use sf_quant::Options;
-use sf_tests::int8::{adversarial, blob, converted, relative_error, shallow, tiny};
+use sf_tests::int8::{adversarial, blob, converted, guided, relative_error, shallow, tiny};
 use sf_tests::tiny::{Frames, Tensors, stages, tensors};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -23,7 +23,7 @@ fn weights(config: &ModelConfig, tensors: &Tensors) -> Weights {
 fn every_stage_follows_the_reference() {
     let pyramids = tiny();
     let linear = shallow(tiny(), 2, 4);
-    for config in [pyramids, linear] {
+    for config in [pyramids, linear, guided()] {
         let tensors = tensors(&config, 3);
         let clip = Frames::new(3, 28, 42, 2);
         let want = reference::run(&weights(&config, &tensors), &config, &clip.input()).unwrap();
@@ -41,8 +41,9 @@ fn every_stage_follows_the_reference() {
             if error > worst.0 {
                 worst = (error, name.clone());
             }
-            // Eight bits through ten narrow layers: at most 2.8 % measured, in the scales, which go with the depth.
-            assert!(error < 0.04, "{name}: {error}");
+            // Eight bits through ten narrow layers and then convolutions with one step for many pixels: up to 4.7 %
+            // measured, in the velocities.
+            assert!(error < 0.08, "{name}: {error}");
         }
         // No error at all would be a network that is not quantized.
         assert!(worst.0 > 5e-3, "{worst:?}");
@@ -129,9 +130,14 @@ fn runs_can_be_stopped() {
 
 #[test]
 fn the_bits_depend_on_nothing() {
-    let config = tiny();
-    let tensors = tensors(&config, 5);
-    let model = converted(&config, &tensors, Options::to(Dtype::Int8));
+    for config in [tiny(), guided()] {
+        bits_of(&config);
+    }
+}
+
+fn bits_of(config: &ModelConfig) {
+    let tensors = tensors(config, 5);
+    let model = converted(config, &tensors, Options::to(Dtype::Int8));
     let clip = Frames::new(2, 28, 42, 6);
     let want = bits(&model, &clip, Isa::Scalar, 1);
     for isa in Isa::ALL {
@@ -143,5 +149,5 @@ fn the_bits_depend_on_nothing() {
         }
     }
     // Conversion gives the same bytes every time.
-    assert!(blob(&config, &tensors, Options::to(Dtype::Int8)) == blob(&config, &tensors, Options::to(Dtype::Int8)));
+    assert!(blob(config, &tensors, Options::to(Dtype::Int8)) == blob(config, &tensors, Options::to(Dtype::Int8)));
 }

@@ -15,11 +15,11 @@
 use crate::arena::{carve, carved_len};
 use crate::dims::Dims;
 use crate::features::Features;
-use crate::model::{Dpt, Linear, Unit};
-use crate::net::Net;
+use crate::model::{Dpt, Unit};
+use crate::net::{ConvLayer, Net};
 use crate::tables::DptTables;
 use sf_formats::config::RcuSkip;
-use sf_ops::conv::{self, Conv, ConvTranspose};
+use sf_ops::conv;
 use sf_ops::elementwise::{add_assign, relu};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
@@ -82,47 +82,7 @@ struct Layers<'a> {
     head: &'a Dpt,
 }
 
-/// One convolution: "same" padding, optional rectifier before and after.
-#[derive(Clone, Copy)]
-struct Layer<'a> {
-    weights: &'a Linear,
-    kernel: usize,
-    stride: usize,
-    act: Act,
-    relu_input: Act,
-}
-
-impl<'a> Layer<'a> {
-    /// Stride 1, nothing before or after.
-    fn same(weights: &'a Linear, kernel: usize) -> Layer<'a> {
-        Layer { weights, kernel, stride: 1, act: Act::None, relu_input: Act::None }
-    }
-}
-
 impl Layers<'_> {
-    /// out = act(conv(x)) + residual.
-    fn conv(&self, layer: Layer, x: Hwc, residual: Option<Hwc>, out: HwcMut) {
-        let model = self.net.model;
-        let conv = Conv {
-            weight: model.panels(&layer.weights.weight),
-            bias: layer.weights.bias.map(|b| model.values(b)),
-            kernel: layer.kernel,
-            stride: layer.stride,
-            pad: layer.kernel / 2,
-            relu_input: layer.relu_input,
-            act: layer.act,
-        };
-        conv::conv2d(self.net.ctx, x, &conv, residual, out);
-    }
-
-    /// Transposed convolution with stride = kernel.
-    fn up(&self, weights: &Linear, kernel: usize, x: Hwc, out: HwcMut) {
-        let model = self.net.model;
-        let bias = weights.bias.map(|b| model.values(b));
-        let up = ConvTranspose { weight: model.panels(&weights.weight), bias, kernel };
-        conv::conv_transpose(self.net.ctx, x, &up, out);
-    }
-
     /// out = RCU(x); x may be overwritten by its rectified self.
     fn unit(&self, unit: &Unit, s: Size, x: &mut [f32], hidden: &mut [f32], out: &mut [f32]) {
         let f = self.head.features;
@@ -136,10 +96,10 @@ impl Layers<'_> {
             RcuSkip::Raw => Act::Relu,
         };
         let x = Hwc::new(x, s.0, s.1, f);
-        let first = Layer { act: Act::Relu, relu_input, ..Layer::same(&unit.conv1, 3) };
-        self.conv(first, x, None, HwcMut::new(hidden, s.0, s.1, f));
+        let first = ConvLayer { act: Act::Relu, relu_input, ..ConvLayer::same(&unit.conv1, 3) };
+        self.net.conv(first, x, None, HwcMut::new(hidden, s.0, s.1, f));
         let hidden = Hwc::new(hidden, s.0, s.1, f);
-        self.conv(Layer::same(&unit.conv2, 3), hidden, Some(x), HwcMut::new(out, s.0, s.1, f));
+        self.net.conv(ConvLayer::same(&unit.conv2, 3), hidden, Some(x), HwcMut::new(out, s.0, s.1, f));
     }
 }
 
@@ -170,21 +130,21 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
         let resized = &mut a[..area(s) * ch];
         let x = match i {
             0 => {
-                layers.up(&head.up4, 4, x, HwcMut::new(resized, s.0, s.1, ch));
+                net.up(&head.up4, 4, x, HwcMut::new(resized, s.0, s.1, ch));
                 Hwc::new(resized, s.0, s.1, ch)
             }
             1 => {
-                layers.up(&head.up2, 2, x, HwcMut::new(resized, s.0, s.1, ch));
+                net.up(&head.up2, 2, x, HwcMut::new(resized, s.0, s.1, ch));
                 Hwc::new(resized, s.0, s.1, ch)
             }
             2 => x,
             _ => {
-                let down = Layer { stride: 2, ..Layer::same(&head.down2, 3) };
-                layers.conv(down, x, None, HwcMut::new(resized, s.0, s.1, ch));
+                let down = ConvLayer { stride: 2, ..ConvLayer::same(&head.down2, 3) };
+                net.conv(down, x, None, HwcMut::new(resized, s.0, s.1, ch));
                 Hwc::new(resized, s.0, s.1, ch)
             }
         };
-        layers.conv(Layer::same(&head.lateral[i], 3), x, None, HwcMut::new(out, s.0, s.1, f));
+        net.conv(ConvLayer::same(&head.lateral[i], 3), x, None, HwcMut::new(out, s.0, s.1, f));
     }
 
     // Fusion: c holds what came from the coarser level; a is each unit's hidden map.
@@ -201,7 +161,7 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
             None => layers.unit(&fusion.unit, s, lateral[i], a, c),
         }
         let out = HwcMut::new(&mut a[..n], s.0, s.1, f);
-        layers.conv(Layer::same(&fusion.out, 1), Hwc::new(&c[..n], s.0, s.1, f), None, out);
+        net.conv(ConvLayer::same(&fusion.out, 1), Hwc::new(&c[..n], s.0, s.1, f), None, out);
         let from = Hwc::new(&a[..n], s.0, s.1, f);
         bilinear(net.ctx, from, Corners::Aligned, HwcMut::new(&mut c[..area(finer) * f], finer.0, finer.1, f));
     }
@@ -210,15 +170,15 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
     let (s, half) = ((8 * d.rows, 8 * d.cols), f / 2);
     let small = &mut a[..area(s) * half];
     let fused = Hwc::new(&c[..area(s) * f], s.0, s.1, f);
-    layers.conv(Layer::same(&head.output1, 3), fused, None, HwcMut::new(small, s.0, s.1, half));
+    net.conv(ConvLayer::same(&head.output1, 3), fused, None, HwcMut::new(small, s.0, s.1, half));
     let full = &mut b[..d.pixels() * half];
     let to = HwcMut::new(full, d.height, d.width, half);
     bilinear(net.ctx, Hwc::new(small, s.0, s.1, half), Corners::Aligned, to);
     net.ctx.pool.chunks(full, d.width * half, &|y, row, _| tables.full.add_row(y, row));
     let hidden = &mut a[..d.pixels() * head.hidden];
-    let second = Layer { act: Act::Relu, ..Layer::same(&head.output2, 3) };
+    let second = ConvLayer { act: Act::Relu, ..ConvLayer::same(&head.output2, 3) };
     let to = HwcMut::new(hidden, d.height, d.width, head.hidden);
-    layers.conv(second, Hwc::new(full, d.height, d.width, half), None, to);
+    net.conv(second, Hwc::new(full, d.height, d.width, half), None, to);
     let hidden = Hwc::new(hidden, d.height, d.width, head.hidden);
-    layers.conv(Layer::same(&head.last, 1), hidden, None, HwcMut::new(job.out, d.height, d.width, head.out));
+    net.conv(ConvLayer::same(&head.last, 1), hidden, None, HwcMut::new(job.out, d.height, d.width, head.out));
 }

@@ -16,12 +16,11 @@
 use super::decoder::{self, Job};
 use crate::arena::{carve, carved_len};
 use crate::dims::Dims;
-use crate::model::{Guided, Linear};
-use crate::net::Net;
+use crate::model::Guided;
+use crate::net::{ConvLayer, Net};
 use crate::probe::Probe;
 use crate::tables::Tables;
 use sf_formats::Result;
-use sf_ops::conv::{self, Conv};
 use sf_ops::elementwise::{pixel_shuffle, pixel_shuffle_beside};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
@@ -92,27 +91,15 @@ pub(crate) fn frame(net: Net, head: &Guided, d: &Dims, job: Paint) {
     // a: x; b: the hidden map; c: x + conv.2, whose ReLU conv.3 applies; b: its outputs.
     let f = head.features;
     let (a, c) = (&mut a[..pixels * f], &mut c[..pixels * f]);
-    let conv = |weights: &Linear, before: Act, after: Act| Conv {
-        weight: net.model.panels(&weights.weight),
-        bias: weights.bias.map(|b| net.model.values(b)),
-        kernel: 3,
-        stride: 1,
-        pad: 1,
-        relu_input: before,
-        act: after,
-    };
-    let [conv0, conv1, conv2, conv3] = &head.convs;
-    let first = conv(conv0, Act::None, Act::Relu);
+    let [conv0, conv1, conv2, conv3] = head.convs.each_ref().map(|weights| ConvLayer::same(weights, 3));
     let joined = Hwc::new(&b[..pixels * inputs], h, w, inputs);
-    conv::conv2d(net.ctx, joined, &first, None, HwcMut::new(a, h, w, f));
+    net.conv(ConvLayer { act: Act::Relu, ..conv0 }, joined, None, HwcMut::new(a, h, w, f));
     let x = Hwc::new(a, h, w, f);
-    let second = conv(conv1, Act::None, Act::Relu);
-    conv::conv2d(net.ctx, x, &second, None, HwcMut::new(&mut b[..pixels * f], h, w, f));
-    let third = conv(conv2, Act::None, Act::None);
-    conv::conv2d(net.ctx, Hwc::new(&b[..pixels * f], h, w, f), &third, Some(x), HwcMut::new(c, h, w, f));
+    net.conv(ConvLayer { act: Act::Relu, ..conv1 }, x, None, HwcMut::new(&mut b[..pixels * f], h, w, f));
+    net.conv(conv2, Hwc::new(&b[..pixels * f], h, w, f), Some(x), HwcMut::new(c, h, w, f));
     let outputs = &mut b[..pixels * 4 * head.out];
-    let last = conv(conv3, Act::Relu, Act::None);
-    conv::conv2d(net.ctx, Hwc::new(c, h, w, f), &last, None, HwcMut::new(outputs, h, w, 4 * head.out));
+    let last = ConvLayer { relu_input: Act::Relu, ..conv3 };
+    net.conv(last, Hwc::new(c, h, w, f), None, HwcMut::new(outputs, h, w, 4 * head.out));
     let out = HwcMut::new(out, d.height, d.width, head.out);
     pixel_shuffle(net.ctx, Mat::new(outputs, pixels, 4 * head.out), (h, w), 2, out);
 }
