@@ -76,7 +76,16 @@ fn a_model_equals_itself_and_int8_is_near() {
 #[test]
 fn a_missed_gate_is_exit_1_with_a_report() {
     let p = place();
-    let r = run(&["compare", s(&p.f32), s(&p.int8), "-i", s(&p.clip), "--gate", "depth_absrel=1e-9,render_psnr=5", "--json"]);
+    let r = run(&[
+        "compare",
+        s(&p.f32),
+        s(&p.int8),
+        "-i",
+        s(&p.clip),
+        "--gate",
+        "depth_absrel=1e-9,render_psnr=5",
+        "--json",
+    ]);
     assert_eq!(r.code, 1);
     let json: Value = serde_json::from_str(&r.stdout).unwrap();
     assert_eq!((json["pass"].as_bool(), json["gates"][0]["pass"].as_bool()), (Some(false), Some(false)));

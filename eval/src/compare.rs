@@ -15,7 +15,8 @@
 //! | `dynamic_flip_fraction` | share of pixels whose dynamic probability crosses the threshold |
 //! | `false_motion_fraction` | share of the pixels static in A that B moves by more than 0.1 units per second |
 //! | `opacity_p99`, `colour_p99`, `scale_log_p99` | 99th percentiles of the differences of the Gaussians |
-//! | `render_psnr_db`, `render_psnr_dynamic_db`, `render_psnr_worst_db` | pictures of both scenes with A's cameras, at the frames' times and halfway between: all pixels, pixels dynamic in A (at the frames), the worst picture |
+//! | `render_psnr_db`, `render_psnr_dynamic_db`, `render_psnr_worst_db` | pictures of both scenes, each with its own cameras (as they are evaluated), at the frames' times and halfway between: all pixels, pixels dynamic in A (at the frames), the worst picture |
+//! | `render_psnr_fixed_db` | the same with A's cameras for both: errors of B's poses show as shifts |
 
 use crate::metrics;
 use glam::DVec3;
@@ -102,6 +103,26 @@ struct Picture {
 }
 
 impl Picture {
+    /// Over the pixels that `keep` takes.
+    fn of(a: &Rendered, b: &Rendered, keep: impl Fn(usize) -> bool) -> Picture {
+        let mut sum = Picture::default();
+        for (i, (a, b)) in a.rgb.as_chunks::<3>().0.iter().zip(b.rgb.as_chunks::<3>().0).enumerate() {
+            if keep(i) {
+                for c in 0..3 {
+                    let d = f64::from(a[c].clamp(0.0, 1.0)) - f64::from(b[c].clamp(0.0, 1.0));
+                    sum.squares += d * d;
+                }
+                sum.count += 3;
+            }
+        }
+        sum
+    }
+
+    fn add(&mut self, other: Picture) {
+        self.squares += other.squares;
+        self.count += other.count;
+    }
+
     fn db(&self) -> Option<f64> {
         (self.count > 0).then(|| (-10.0 * (self.squares / self.count as f64).log10()).min(metrics::MAX_PSNR))
     }
@@ -128,6 +149,7 @@ pub struct Comparison {
     full: Picture,
     dynamic: Picture,
     worst: Option<f64>,
+    fixed: Picture,
 }
 
 impl Comparison {
@@ -200,38 +222,30 @@ impl Comparison {
         let frames = &a.scene.frames;
         let mut times: Vec<(f64, Option<usize>)> = frames.iter().enumerate().map(|(f, s)| (s.time, Some(f))).collect();
         times.extend(frames.windows(2).map(|pair| (0.5 * (pair[0].time + pair[1].time), None)));
-        let (mut gaussians, mut drawn) = (Gaussians::default(), [Rendered::default(), Rendered::default()]);
+        let mut gaussians = Gaussians::default();
+        let mut drawn = [Rendered::default(), Rendered::default(), Rendered::default()];
         for (time, frame) in times {
-            let camera: Camera = match frame {
-                Some(f) => frames[f].camera,
-                None => a.scene.camera_at(time)?,
+            let camera = |scene: &Scene| -> Result<Camera> {
+                match frame {
+                    Some(f) => Ok(scene.frames[f].camera),
+                    None => scene.camera_at(time),
+                }
             };
-            for (side, drawn) in [a, b].into_iter().zip(&mut drawn) {
+            let (camera_a, camera_b) = (camera(a.scene)?, camera(b.scene)?);
+            for ((side, camera), drawn) in [(a, camera_a), (b, camera_b), (b, camera_a)].into_iter().zip(&mut drawn) {
                 let rules: &Compose = &side.scene.compose;
                 side.scene.at_into(time, rules, &mut gaussians)?;
                 let options = RenderOptions::default();
                 renderer.render_into(&gaussians, &camera, &side.scene.splat, &options, drawn)?;
             }
-            let pixels = camera.width as usize * camera.height as usize;
-            let moving = |i: usize| {
-                frame.is_some_and(|f| {
-                    a.dynamic.len() == frames.len() * pixels && a.dynamic[f * pixels + i] >= a.scene.compose.tau
-                })
-            };
-            let mut this = Picture::default();
-            for i in 0..pixels {
-                let mut squares = 0.0;
-                for c in 3 * i..3 * i + 3 {
-                    let [x, y] = [&drawn[0], &drawn[1]].map(|d| f64::from(d.rgb[c].clamp(0.0, 1.0)));
-                    squares += (x - y) * (x - y);
-                }
-                this = Picture { squares: this.squares + squares, count: this.count + 3 };
-                if moving(i) {
-                    self.dynamic = Picture { squares: self.dynamic.squares + squares, count: self.dynamic.count + 3 };
-                }
-            }
-            self.full = Picture { squares: self.full.squares + this.squares, count: self.full.count + this.count };
-            let db = this.db().unwrap_or(metrics::MAX_PSNR);
+            let pixels = camera_a.width as usize * camera_a.height as usize;
+            let known = a.dynamic.len() == frames.len() * pixels;
+            let moving = |i: usize| known && frame.is_some_and(|f| a.dynamic[f * pixels + i] >= a.scene.compose.tau);
+            let [own, fixed] = [1, 2].map(|of| Picture::of(&drawn[0], &drawn[of], |_| true));
+            self.dynamic.add(Picture::of(&drawn[0], &drawn[1], moving));
+            self.full.add(own);
+            self.fixed.add(fixed);
+            let db = own.db().unwrap_or(metrics::MAX_PSNR);
             self.worst = Some(self.worst.map_or(db, |w| w.min(db)));
         }
         Ok(())
@@ -263,6 +277,7 @@ impl Comparison {
             ("render_psnr_db", self.full.db()),
             ("render_psnr_dynamic_db", self.dynamic.db()),
             ("render_psnr_worst_db", self.worst),
+            ("render_psnr_fixed_db", self.fixed.db()),
         ]
     }
 }
