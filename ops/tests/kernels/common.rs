@@ -87,8 +87,9 @@ pub(crate) fn kernel_sets() -> Vec<&'static Kernels> {
 /// The first call is the portable one.
 pub(crate) fn everywhere(mut f: impl FnMut(Ctx, &str)) {
     let sets = kernel_sets();
-    let pool = Pool::new(1).unwrap();
     for kernels in &sets {
+        // A new pool, so that its working memory has the size that these kernels ask for.
+        let pool = Pool::new(1).unwrap();
         f(Ctx { pool: &pool, kernels }, kernels.isa.name());
     }
     for threads in [2, 3] {

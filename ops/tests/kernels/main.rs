@@ -6,6 +6,7 @@ mod attention_s8;
 mod common;
 mod conv;
 mod conv_s8;
+mod exact;
 mod gemm;
 mod gemm_s8;
 mod hash;
