@@ -74,13 +74,8 @@ impl Machine {
 
 /// Name and kernels of one instruction set.
 pub(crate) fn kernels_json(k: &Kernels) -> Value {
-    json!({
-        "isa": k.isa.name(),
-        "gemm_f32": k.gemm_f32.name,
-        "gemm_f16": k.gemm_f16.name,
-        "gemm_s8": k.gemm_s8.name,
-        "vector": k.vector.name,
-    })
+    let rows = k.rows().into_iter().map(|(family, name)| (family.to_string(), name.into()));
+    Value::Object(std::iter::once(("isa".to_string(), k.isa.name().into())).chain(rows).collect())
 }
 
 /// Runnable tasks of the whole machine, averaged over the last minute.

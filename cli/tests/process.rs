@@ -72,7 +72,13 @@ fn p18_an_instruction_set_that_is_not_here() {
     let line = fails(7, &["doctor", "--isa", foreign]);
     assert!(line.contains(foreign) && line.contains("scalar"), "{line}");
     assert!(fails(2, &["doctor", "--isa", "mmx"]).contains("scalar"));
-    assert_eq!(ok_json(&["doctor", "--isa", "scalar"])["kernels"]["isa"], "scalar");
+    let kernels = &ok_json(&["doctor", "--isa", "scalar"])["kernels"];
+    assert_eq!(kernels["isa"], "scalar");
+    // The row of every family.
+    for (family, row) in sf_ops::Kernels::capped(sf_ops::cpu::Isa::Scalar).unwrap().rows() {
+        assert_eq!(kernels[family], row);
+        assert!(row.ends_with("_scalar"), "{family}: {row}");
+    }
     // The environment can only lower, and a value it does not know is not ignored.
     let with = |value| ran(command(&["doctor", "--json"]).env("STREETFORWARD_CPU", value).output().unwrap());
     let r = with("scalar");

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 fn main() -> ExitCode {
     match Kernels::from_env() {
         Ok(k) => {
-            println!("{}: {}, {}, {}", k.isa.name(), k.vector.name, k.gemm_f16.name, k.gemm_s8.name);
+            println!("{}: {}", k.isa.name(), k.rows().map(|(_, name)| name).join(", "));
             ExitCode::SUCCESS
         }
         Err(why) => {

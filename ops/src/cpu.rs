@@ -187,6 +187,17 @@ impl Kernels {
         }
     }
 
+    /// Every family with the name of its row: what tools print, so that none is left out.
+    pub fn rows(&self) -> [(&'static str, &'static str); 5] {
+        [
+            ("gemm_f32", self.gemm_f32.name),
+            ("gemm_f16", self.gemm_f16.name),
+            ("product_s8", self.product_s8.name),
+            ("gemm_s8", self.gemm_s8.name),
+            ("vector", self.vector.name),
+        ]
+    }
+
     fn table() -> &'static [Kernels] {
         static TABLE: OnceLock<Vec<Kernels>> = OnceLock::new();
         TABLE.get_or_init(|| {

@@ -503,14 +503,7 @@ fn footer(
         clock(mhz_after),
     ));
     for k in kernels {
-        text.push_str(&format!(
-            "{}: {}, {}, {}, {}\n",
-            k.isa.name(),
-            k.gemm_f32.name,
-            k.gemm_f16.name,
-            k.gemm_s8.name,
-            k.vector.name
-        ));
+        text.push_str(&format!("{}: {}\n", k.isa.name(), k.rows().map(|(_, name)| name).join(", ")));
     }
     let dot = [Features::AVX_VNNI, Features::AVX512_VNNI, Features::NEON_DOT];
     for k in kernels.iter().filter(|k| !dot.iter().any(|&f| k.features.has(f))) {

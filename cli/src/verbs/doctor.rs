@@ -60,8 +60,9 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     row("governor", m.governor.unwrap_or_else(|| "unknown".into()));
     let names: Vec<&str> = Kernels::available().map(|k| k.isa.name()).collect();
     row("isa", format!("{} of {}", chosen.isa.name(), names.join(", ")));
-    let names = [chosen.gemm_f32.name, chosen.gemm_f16.name, chosen.gemm_s8.name, chosen.vector.name];
-    row("kernels", names.join(", "));
+    for (family, name) in chosen.rows() {
+        row(family, name.into());
+    }
     row("peak", format!("{:.0} GFLOP/s f32, {:.0} GOP/s int8, one core", f32_peak / 1e9, s8_peak / 1e9));
     console.report(&json, &text)
 }
