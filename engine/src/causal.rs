@@ -21,6 +21,7 @@ use sf_formats::Result;
 use sf_formats::config::{Concat, Extrapolate, ModelConfig, MotionLayout};
 use sf_ops::attention::FrameMask;
 use sf_ops::mat::Mat;
+use std::ops::Range;
 
 /// Tokens per frame.
 pub(crate) fn tokens(config: &ModelConfig, d: &Dims) -> usize {
@@ -190,41 +191,50 @@ impl Pass<'_> {
         Ok(())
     }
 
-    /// The motion head on this pass's tokens or taps.
+    /// Frames whose map is read: the others mirror the other direction, and only a tap wants to see them.
+    fn read(&self, tapped: bool) -> Range<usize> {
+        let (config, n) = (self.net.model.config(), self.d.frames);
+        let read = |f: usize| tapped || is_read(config, self.direction, f, n);
+        let first = (0..n).find(|&f| read(f)).unwrap_or(n);
+        first..(first..n).rfind(|&f| read(f)).map_or(first, |last| last + 1)
+    }
+
+    /// The motion head on this pass's tokens or taps. It looks at one frame at a time, so that frames nobody reads
+    /// are left out from its decoder on.
     fn motion(&self, x: &[f32], tapped: &[f32], scratch: &mut [f32], raw: &mut [f32], probe: &mut Probe) -> Result<()> {
-        let (d, dim) = (self.d, self.blocks[0].dim);
+        let dim = self.blocks[0].dim;
+        let frames = self.read(probe.tapped());
+        let d = &Dims { frames: frames.len(), ..*self.d };
         let head = self.net.model.weights().motion.as_ref().expect("a causal module has a motion head");
         let dense = Dense {
             net: self.net,
             dims: d,
             tables: self.tables,
             dpt: self.tables.motion.as_ref(),
-            guide: self.guide,
+            guide: &self.guide[frames.start * self.guide.len() / self.d.frames..],
             head,
             tokens: Tokens::Patches,
             name: "motion",
         };
-        let features = |data| Features::dense(data, dim, d, self.mask.tokens);
+        let row = self.mask.tokens * dim;
+        let (read, tokens) = (frames.start * row..frames.end * row, self.mask.tokens);
         let source = match head {
-            DenseHead::Linear(_) | DenseHead::Guided(_) => Source::Tokens(features(x)),
+            DenseHead::Linear(_) | DenseHead::Guided(_) => Source::Tokens(Features::dense(&x[read], dim, d, tokens)),
             DenseHead::Dpt(dpt) => {
                 let kept = taps(self.net.model);
                 Source::Taps(dpt.taps.map(|t| {
                     let slot = kept.iter().position(|&k| k == t).expect("every tap is kept");
-                    features(&tapped[slot * x.len()..][..x.len()])
+                    Features::dense(&tapped[slot * x.len()..][read.clone()], dim, d, tokens)
                 }))
             }
         };
         dense.prepare(source, scratch, probe)?;
-        let out = heads::channels(head);
-        for (f, map) in raw.chunks_exact_mut(d.pixels() * out).enumerate() {
-            // Only a tap wants a map that is never read.
-            if !is_read(self.net.model.config(), self.direction, f, d.frames) && !probe.tapped() {
-                continue;
-            }
+        let (out, first) = (heads::channels(head), frames.start);
+        let maps = raw.chunks_exact_mut(d.pixels() * out).skip(first).take(frames.len());
+        for (f, map) in maps.enumerate() {
             dense.frame(source, f, scratch, map);
             probe.guard(format_args!("motion.{}", self.name), map)?;
-            probe.emit(format_args!("motion.{}", self.name), Some(f), &[d.height, d.width, out], map);
+            probe.emit(format_args!("motion.{}", self.name), Some(first + f), &[d.height, d.width, out], map);
         }
         Ok(())
     }

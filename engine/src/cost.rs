@@ -135,6 +135,14 @@ fn passes(config: &ModelConfig, d: &Dims) -> Vec<Reach> {
     [Some(first), second].into_iter().flatten().collect()
 }
 
+/// Frames of every pass whose motion map is read.
+fn read_frames(c: &ModelConfig, d: &Dims) -> Vec<usize> {
+    let (ahead, behind) = Reach::directions(c);
+    let directions = [Some(ahead), behind].into_iter().flatten().take(passes(c, d).len());
+    let read = |direction: Reach| (0..d.frames).filter(|&i| causal::is_read(c, direction, i, d.frames)).count();
+    directions.map(read).collect()
+}
+
 /// What the queries of a block see, once for every time that it runs; `name` is a tensor of the block.
 fn masks(c: &ModelConfig, d: &Dims, name: &str) -> Vec<FrameMask> {
     let part = name.split('.').next().unwrap_or_default();
@@ -142,7 +150,10 @@ fn masks(c: &ModelConfig, d: &Dims, name: &str) -> Vec<FrameMask> {
     match part {
         "encoder" => vec![d.frame_mask(d.encoder_tokens)],
         "decoder" if is_global(c, layer(name)) => vec![d.global_mask()],
-        "motion_decoder" => vec![d.frame_mask(d.patches); passes.len()],
+        "motion_decoder" => {
+            let read = |frames| FrameMask { frames, ..d.frame_mask(d.patches) };
+            read_frames(c, d).into_iter().map(read).collect()
+        }
         "causal" | "causal_back" => {
             let run = match (part, c.causal_share) {
                 ("causal", true) => &passes[..],
@@ -184,13 +195,8 @@ fn rows(c: &ModelConfig, d: &Dims, name: &str) -> (&'static str, usize) {
             };
             ("causal", runs * f * causal::tokens(c, d))
         }
-        "motion_decoder" => ("motion", passes.len() * f * d.patches),
-        "motion_head" => {
-            let (ahead, behind) = Reach::directions(c);
-            let directions = [Some(ahead), behind].into_iter().flatten().take(passes.len());
-            let read = |direction: Reach| (0..f).filter(|&i| causal::is_read(c, direction, i, f)).count();
-            ("motion", directions.map(read).sum::<usize>() * head_rows(d, rest))
-        }
+        "motion_decoder" => ("motion", read_frames(c, d).iter().sum::<usize>() * d.patches),
+        "motion_head" => ("motion", read_frames(c, d).iter().sum::<usize>() * head_rows(d, rest)),
         _ => {
             let stage = match part.split('_').next() {
                 Some("point") => "depth",
@@ -237,7 +243,12 @@ mod tests {
         let (p, dim) = ((height / 14 * (width / 14)) as f64, f64::from(config.causal_dim()));
         let shared = 2e-9 * 4.0 * p * 3.0 * dim * dim;
         let unread = match config.motion.kind {
-            HeadKind::XdecLinear => 2e-9 * 2.0 * p * 196.0 * f64::from(config.motion.out * config.motion.dim),
+            HeadKind::XdecLinear => {
+                // Of one frame in each of two passes: the last layer, both projections, and the decoder's blocks.
+                let (m, out) = (f64::from(config.motion.dim), f64::from(config.motion.out));
+                let blocks = f64::from(config.motion.depth) * (12.0 * m * m + 2.0 * p * m);
+                2e-9 * 2.0 * p * (196.0 * out * m + dim * m + m * m + blocks)
+            }
             _ => 0.0,
         };
         vec![

@@ -12,6 +12,7 @@ use crate::heads::{self, Dense, Source};
 use crate::input::Input;
 use crate::intrinsics::{self, Evidence};
 use crate::model::{DenseHead, Model};
+use crate::motion::Direction;
 use crate::net::Net;
 use crate::output::{Flags, Output};
 use crate::plan::{Plan, trunk_lens};
@@ -21,7 +22,7 @@ use crate::unproject::{self, View};
 use crate::{causal, encoder, gaussians, motion};
 use sf_formats::config::{Concat, DepthMap, ModelConfig, MotionLayout};
 use sf_formats::{Pose, Result};
-use sf_ops::activation::exp;
+use sf_ops::elementwise::{exp_in_place, sigmoid_in_place};
 use sf_ops::opclock::{self, Op, Work};
 
 /// Results and small per-frame records of a session.
@@ -202,30 +203,30 @@ impl Forward<'_> {
                 DepthMap::Pi3Point => {
                     let points = &mut out.points[pixels];
                     dense.frame(source, f, work, points.as_flattened_mut());
-                    pool.chunks(points, d.width, &|_, row, _| {
-                        for p in row {
-                            let z = exp(p[2]);
+                    depth.iter_mut().zip(&*points).for_each(|(z, p)| *z = p[2]);
+                    exp_in_place(self.net.ctx, depth);
+                    let z = &*depth;
+                    pool.chunks(points, d.width, &|v, row, _| {
+                        for (p, &z) in row.iter_mut().zip(&z[v * d.width..]) {
                             *p = [p[0] * z, p[1] * z, z];
                         }
                     });
-                    depth.iter_mut().zip(&*points).for_each(|(z, p)| *z = p[2]);
                     probe.guard(format_args!("depth"), points.as_flattened())?;
                     probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 3], points.as_flattened());
                 }
                 DepthMap::ExpZ => {
                     dense.frame(source, f, work, depth);
-                    pool.chunks(depth, d.width, &|_, row, _| row.iter_mut().for_each(|z| *z = exp(*z)));
+                    exp_in_place(self.net.ctx, depth);
                     probe.guard(format_args!("depth"), depth)?;
                     probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 1], depth);
                 }
                 DepthMap::ExpZConf => {
                     let conf = &mut out.conf[pixels];
                     dense.frame(source, f, work, raw);
-                    pool.chunks(depth, d.width, &|v, row, _| {
-                        let raw = &raw[2 * v * d.width..][..2 * d.width];
-                        row.iter_mut().zip(raw.chunks_exact(2)).for_each(|(z, p)| *z = exp(p[0]));
-                    });
-                    conf.iter_mut().zip(raw.chunks_exact(2)).for_each(|(c, p)| *c = p[1]);
+                    for ((z, c), p) in depth.iter_mut().zip(&mut *conf).zip(raw.chunks_exact(2)) {
+                        (*z, *c) = (p[0], p[1]);
+                    }
+                    exp_in_place(self.net.ctx, depth);
                     probe.guard(format_args!("depth"), depth)?;
                     probe.guard(format_args!("conf"), conf)?;
                     probe.emit(format_args!("point"), Some(f), &[d.height, d.width, 1], depth);
@@ -331,9 +332,21 @@ impl Forward<'_> {
             None => gaussians::Raw::Priors(conf.map(|c| &c[v * w..][..w])),
         };
         let (image, depth) = (self.input.frame(f), &out.depth[pixels.clone()]);
-        pool.chunks(&mut out.scale[pixels.clone()], w, &|v, s, _| map.scale_row(row(v), &depth[v * w..][..w], s));
+        let (scale, opacity) = (&mut out.scale[pixels.clone()], &mut out.opacity[pixels.clone()]);
+        if map.in_steps() {
+            pool.chunks(scale, w, &|v, s, _| map.start_row(row(v), s));
+            exp_in_place(self.net.ctx, scale.as_flattened_mut());
+            pool.chunks(scale, w, &|v, s, _| map.finish_row(&depth[v * w..][..w], s));
+            pool.chunks(opacity, w, &|v, o, _| map.start_opacity_row(row(v), o));
+            sigmoid_in_place(self.net.ctx, opacity);
+            if raw.is_none() {
+                pool.chunks(opacity, w, &|v, o, _| map.finish_opacity_row(row(v), o));
+            }
+        } else {
+            pool.chunks(scale, w, &|v, s, _| map.scale_row(row(v), &depth[v * w..][..w], s));
+            pool.chunks(opacity, w, &|v, o, _| map.opacity_row(row(v), o));
+        }
         pool.chunks(&mut out.quat[pixels.clone()], w, &|v, q, _| map.quat_row(row(v), q));
-        pool.chunks(&mut out.opacity[pixels.clone()], w, &|v, o, _| map.opacity_row(row(v), o));
         pool.chunks(&mut out.colour[pixels], w, &|v, c, _| map.colour_row(row(v), &image[3 * v * w..][..3 * w], c));
     }
 
@@ -353,10 +366,18 @@ impl Forward<'_> {
                 MotionLayout::SinglePass => motion::Raw::Single(&fwd[part(fwd)]),
             }
         };
-        let (out, maps, pool) = (&mut memory.output, &memory.motion, self.net.ctx.pool);
+        let (out, maps, ctx) = (&mut memory.output, &memory.motion, self.net.ctx);
+        let pool = ctx.pool;
+        // Probabilities first: those of the second pass wait where the backward velocities will be.
+        let second = &mut out.v_bwd.as_flattened_mut()[..out.dynamic.len()];
+        pool.chunks(&mut out.dynamic, w, &|r, p, _| maps[r / d.height].logit_row(row(r), Direction::Forward, p));
+        pool.chunks(second, w, &|r, p, _| maps[r / d.height].logit_row(row(r), Direction::Backward, p));
+        sigmoid_in_place(ctx, &mut out.dynamic);
+        sigmoid_in_place(ctx, second);
+        let (second, single) = (&*second, bwd.is_empty());
+        pool.chunks(&mut out.dynamic, w, &|r, p, _| maps[r / d.height].combine_row(&second[r * w..][..w], p, single));
         pool.chunks(&mut out.v_fwd, w, &|r, v, _| maps[r / d.height].forward_row(row(r), v));
         pool.chunks(&mut out.v_bwd, w, &|r, v, _| maps[r / d.height].backward_row(row(r), v));
-        pool.chunks(&mut out.dynamic, w, &|r, p, _| maps[r / d.height].dynamic_row(row(r), p));
     }
 
     /// The last guard, and the outputs as stages.

@@ -91,6 +91,44 @@ impl Map {
         }
     }
 
+    /// Whether scales are an exponential and opacities a sigmoid of what [`Map::start_row`] writes: then whole maps
+    /// go through the vector kernels, which have the bits of the scalar functions here.
+    pub(crate) fn in_steps(&self) -> bool {
+        self.kind == GsMap::Residual
+    }
+
+    /// The arguments of the exponential of a row.
+    pub(crate) fn start_row(&self, raw: Raw, scale: &mut [[f32; 3]]) {
+        for (u, scale) in scale.iter_mut().enumerate() {
+            let d = raw.pixel(u);
+            *scale = std::array::from_fn(|c| d[4 + c].clamp(-4.0, 4.0));
+        }
+    }
+
+    /// The argument of the sigmoid of a row.
+    pub(crate) fn start_opacity_row(&self, raw: Raw, opacity: &mut [f32]) {
+        opacity.iter_mut().enumerate().for_each(|(u, o)| *o = raw.pixel(u)[3] + 2.0);
+    }
+
+    /// From the exponentials to scales; `depth` as in [`Map::scale_row`].
+    pub(crate) fn finish_row(&self, depth: &[f32], scale: &mut [[f32; 3]]) {
+        for (scale, &z) in scale.iter_mut().zip(depth) {
+            let prior = self.footprint * z;
+            *scale = scale.map(|e| prior * e);
+        }
+    }
+
+    /// Hides what [`Map::opacity_row`] hides.
+    pub(crate) fn finish_opacity_row(&self, raw: Raw, opacity: &mut [f32]) {
+        if let Raw::Priors(Some(conf)) = raw {
+            for (o, &c) in opacity.iter_mut().zip(conf) {
+                if activation::sigmoid(c) < self.conf_min {
+                    *o = 0.0;
+                }
+            }
+        }
+    }
+
     /// Scales; `depth` is the row's z-depth in scene units.
     pub(crate) fn scale_row(&self, raw: Raw, depth: &[f32], out: &mut [[f32; 3]]) {
         for (u, scale) in out.iter_mut().enumerate() {
@@ -153,6 +191,35 @@ mod tests {
         assert!((opacity[0] - 0.880_797).abs() < 1e-6);
         assert!((scale[0][1] - 0.7 * 5.0 / 50.0).abs() < 1e-7);
         assert!((quat[0][0] - 0.3f32.cos()).abs() < 1e-6 && (quat[0][2] - 0.3f32.sin()).abs() < 1e-6);
+    }
+
+    /// The steps that whole maps go through give the bits of the row functions that define them.
+    #[test]
+    fn steps_have_the_bits_of_the_rows() {
+        use sf_ops::elementwise::{exp_in_place, sigmoid_in_place};
+        let map = Map::new(&ModelConfig::base(), &view());
+        assert!(map.in_steps());
+        let n = 37;
+        let raw: Vec<f32> = (0..n * CHANNELS).map(|i| ((i * 71 % 203) as f32 - 101.0) / 17.0).collect();
+        let depth: Vec<f32> = (0..n).map(|u| 0.5 + u as f32).collect();
+        let conf: Vec<f32> = (0..n).map(|u| u as f32 / 4.0 - 5.0).collect();
+        let pool = sf_ops::par::Pool::new(1).unwrap();
+        for raw in [Raw::Head(&raw), Raw::Priors(None), Raw::Priors(Some(&conf))] {
+            for kernels in sf_ops::Kernels::available() {
+                let ctx = sf_ops::Ctx { pool: &pool, kernels };
+                let (mut scale, mut opacity) = (vec![[9.0; 3]; n], vec![9.0; n]);
+                map.start_row(raw, &mut scale);
+                exp_in_place(ctx, scale.as_flattened_mut());
+                map.finish_row(&depth, &mut scale);
+                map.start_opacity_row(raw, &mut opacity);
+                sigmoid_in_place(ctx, &mut opacity);
+                map.finish_opacity_row(raw, &mut opacity);
+                let (mut want_scale, mut want_opacity) = (vec![[9.0; 3]; n], vec![9.0; n]);
+                map.scale_row(raw, &depth, &mut want_scale);
+                map.opacity_row(raw, &mut want_opacity);
+                assert_eq!((scale, opacity), (want_scale, want_opacity));
+            }
+        }
     }
 
     #[test]

@@ -69,6 +69,13 @@ impl Raw<'_> {
     }
 }
 
+/// A direction of time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Direction {
+    Forward,
+    Backward,
+}
+
 /// How one frame's raw motion becomes velocity in world axes per second.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Map {
@@ -149,6 +156,40 @@ impl Map {
         out.iter_mut().enumerate().for_each(|(u, v)| *v = self.pixel(&raw, u).1);
     }
 
+    /// Logits of a direction's dynamic probability; zeros where the direction is not read.
+    pub(crate) fn logit_row(&self, raw: Raw, direction: Direction, out: &mut [f32]) {
+        let (forward, (ahead, behind)) = (direction == Direction::Forward, self.seen);
+        match raw {
+            Raw::Passes(f, _) if forward && ahead => self.logits(f, 4, 3, out),
+            Raw::Passes(_, b) if !forward && behind => self.logits(b, 4, 3, out),
+            Raw::Single(s) if forward && (ahead || behind) => self.logits(s, 7, 6, out),
+            _ => out.fill(0.0),
+        }
+    }
+
+    fn logits(&self, raw: &[f32], channels: usize, channel: usize, out: &mut [f32]) {
+        out.iter_mut().zip(raw.chunks_exact(channels)).for_each(|(o, r)| *o = r[channel] + self.bias);
+    }
+
+    /// [`Map::dynamic_row`] from the sigmoids of both directions' logits; `forward` in and the result out.
+    pub(crate) fn combine_row(&self, backward: &[f32], forward: &mut [f32], single: bool) {
+        for (f, &b) in forward.iter_mut().zip(backward) {
+            *f = match (self.seen, single) {
+                ((false, false), _) => 0.0,
+                (_, true) | ((true, false), _) => *f,
+                ((false, true), _) => b,
+                ((true, true), _) => self.combine(*f, b),
+            };
+        }
+    }
+
+    fn combine(&self, f: f32, b: f32) -> f32 {
+        match self.combine {
+            Combine::Mean => 0.5 * (f + b),
+            Combine::Max => f.max(b),
+        }
+    }
+
     /// Dynamic probabilities of a row, over the directions that have a neighbour.
     pub(crate) fn dynamic_row(&self, raw: Raw, out: &mut [f32]) {
         let p = |logit: f32| activation::sigmoid(logit + self.bias);
@@ -158,13 +199,7 @@ impl Map {
                 (Raw::Single(s), _) => p(s[7 * u + 6]),
                 (Raw::Passes(f, _), (true, false)) => p(f[4 * u + 3]),
                 (Raw::Passes(_, b), (false, true)) => p(b[4 * u + 3]),
-                (Raw::Passes(f, b), (true, true)) => {
-                    let (f, b) = (p(f[4 * u + 3]), p(b[4 * u + 3]));
-                    match self.combine {
-                        Combine::Mean => 0.5 * (f + b),
-                        Combine::Max => f.max(b),
-                    }
-                }
+                (Raw::Passes(f, b), (true, true)) => self.combine(p(f[4 * u + 3]), p(b[4 * u + 3])),
             };
         }
     }
@@ -216,6 +251,34 @@ mod tests {
         let (vf, vb, _) = run(&[0.0, 0.1, 0.2], 2);
         assert_eq!((vf, vb), ([0.0, 0.0, -1.0], [0.0, 0.0, 1.0]));
         assert_eq!(run(&[0.0], 0), ([0.0; 3], [0.0; 3], 0.0));
+    }
+
+    /// Logits, sigmoid and combination in steps give the bits of the row function that defines them.
+    #[test]
+    fn steps_have_the_bits_of_the_rows() {
+        let raw: Vec<f32> = (0..4 * 21).map(|i| (i * 37 % 101) as f32 / 9.0 - 5.0).collect();
+        let back: Vec<f32> = raw.iter().rev().copied().collect();
+        for combine in [Combine::Mean, Combine::Max] {
+            for layout in [MotionLayout::PerDirection, MotionLayout::SinglePass] {
+                let c = ModelConfig { motion_combine: combine, motion_layout: layout, ..ModelConfig::nano() };
+                let single = layout == MotionLayout::SinglePass;
+                let raw = if single { Raw::Single(&raw) } else { Raw::Passes(&raw, &back) };
+                let n = if single { 12 } else { 21 };
+                for (times, f) in [(&[0.0][..], 0), (&[0.0, 0.1, 0.3], 0), (&[0.0, 0.1, 0.3], 1), (&[0.0, 0.1, 0.3], 2)]
+                {
+                    let map = Map::new(&c, times, f, TURN);
+                    let (mut forward, mut backward, mut want) = (vec![9.0; n], vec![9.0; n], vec![9.0; n]);
+                    map.logit_row(raw, Direction::Forward, &mut forward);
+                    map.logit_row(raw, Direction::Backward, &mut backward);
+                    for p in forward.iter_mut().chain(&mut backward) {
+                        *p = activation::sigmoid(*p);
+                    }
+                    map.combine_row(&backward, &mut forward, single);
+                    map.dynamic_row(raw, &mut want);
+                    assert_eq!(forward, want, "{combine:?} {layout:?} frame {f} of {}", times.len());
+                }
+            }
+        }
     }
 
     #[test]
