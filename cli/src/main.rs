@@ -20,6 +20,7 @@
 //! | `video.rs` | animated PNG, y4m, mp4 |
 //! | `html.rs`, `assets/viewer/` | a scene as one page for a browser |
 //! | `report.rs` | results as tables and charts on one page |
+//! | `growth.rs` | how cost grows with the clip, as a chart |
 //! | `machine.rs` | processor, memory, load, clock, measured peaks |
 //! | `bench/` | what `bench` is made of |
 //! | `signals.rs` | Ctrl-C, file-size limits, truncated mappings |
@@ -31,6 +32,7 @@ mod bench;
 mod exit;
 mod folder;
 mod golden;
+mod growth;
 mod html;
 mod machine;
 mod model;

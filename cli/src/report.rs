@@ -3,6 +3,7 @@
 //! A document is shown by its `schema`; of one that is not known every number is listed under its key. Charts are
 //! inline SVG; the page fetches nothing.
 
+use crate::growth;
 use crate::html::{StripPicture, base64};
 use serde_json::Value;
 use sf_formats::Result;
@@ -11,7 +12,7 @@ use std::fmt::Write;
 
 const STYLE: &str = include_str!("../assets/report.css");
 /// Colours of stages, told apart on light and dark ground.
-const COLOURS: [&str; 10] =
+pub(crate) const COLOURS: [&str; 10] =
     ["#4c78a8", "#f2a65a", "#54a24b", "#e45756", "#72b7b2", "#b279a2", "#c5a03f", "#8c6d5a", "#7f8fa6", "#d67195"];
 
 /// Text that is safe in HTML.
@@ -39,6 +40,7 @@ pub(crate) fn document(v: &Value, name: &str) -> String {
     let kind = schema.strip_prefix("streetforward.").and_then(|s| s.split('/').next()).unwrap_or_default();
     let (heading, body) = match kind {
         "bench" => ("Latency", bench(v)),
+        "peers" => ("Beside other runtimes", peers(v)),
         "compare" => ("Two models compared", compare(v)),
         "eval" => ("Accuracy", eval(v)),
         "demo" => ("Demonstration", session(v) + &eval(&v["eval"])),
@@ -88,7 +90,7 @@ pub(crate) fn scene(name: &str, summary: &str, strip: &[StripPicture], sheet: Op
 }
 
 /// A number with four digits that count.
-fn short(v: f64) -> String {
+pub(crate) fn short(v: f64) -> String {
     match v.abs() {
         a if a == 0.0 || a >= 1000.0 => format!("{v:.0}"),
         a if a >= 100.0 => format!("{v:.1}"),
@@ -290,7 +292,7 @@ fn bench(v: &Value) -> String {
     let bar =
         |r: &&Value| Bar { label: name(r), total: r["p50_ms"].as_f64().unwrap_or(0.0), parts: stages(&r["stages"]) };
     let lines: Vec<Bar> = results.iter().map(bar).collect();
-    let mut out = table(&heads, &rows) + "<h3>Stages</h3>" + &bars(&lines);
+    let mut out = table(&heads, &rows) + &growth::charts(&results) + "<h3>Stages</h3>" + &bars(&lines);
     for r in &results {
         let ms: Vec<f64> = match (r["samples_ms"].as_array(), r["samples_ns"].as_array()) {
             (Some(list), _) => list.iter().filter_map(Value::as_f64).collect(),
@@ -301,6 +303,51 @@ fn bench(v: &Value) -> String {
         if !chart.is_empty() {
             out.push_str(&chart.replacen("<h3>", &format!("<h3>{}: ", name(r)), 1));
         }
+    }
+    out
+}
+
+/// This engine beside other runtimes, as `bench/peers` measures them.
+fn peers(v: &Value) -> String {
+    let results: Vec<&Value> = v["results"].as_array().into_iter().flatten().collect();
+    let name = |r: &Value| {
+        let part = |key: &str| r[key].as_str().unwrap_or_default().to_string();
+        let note = Some(part("note")).filter(|n| !n.is_empty()).map_or(String::new(), |n| format!(" ({n})"));
+        format!("{} {}{note}", part("runtime"), part("precision"))
+    };
+    let ran: Vec<&&Value> = results.iter().filter(|r| r["median_ms"].is_number()).collect();
+    let row = |r: &&&Value| {
+        let mut cells = vec![escape(&name(r))];
+        let of = |v: &Value, unit: f64| v.as_f64().map_or("n/a".into(), |x| short(x / unit));
+        for key in ["median_ms", "round_low_ms", "round_high_ms", "times_ours", "cold_start_s"] {
+            cells.push(of(&r[key], 1.0));
+        }
+        cells.push(of(&r["peak_rss_bytes"], f64::from(1 << 20)));
+        cells.extend(["depth_absrel", "rotation_deg", "velocity_epe"].map(|key| of(&r["error"][key], 1.0)));
+        cells
+    };
+    let heads = ["runtime", "ms", "lowest round", "highest", "x ours", "first result s", "peak MiB"];
+    let heads = [&heads[..], &["depth abs-rel", "rotation deg", "velocity units/s"]].concat();
+    let bar = |r: &&&Value| {
+        let total = r["median_ms"].as_f64().unwrap_or(0.0);
+        let (ours, other) = (("StreetForward".to_string(), total), ("others".to_string(), total));
+        Bar { label: name(r), total, parts: vec![if r["runtime"] == "StreetForward" { ours } else { other }] }
+    };
+    let facts = format!(
+        "<p class=\"quiet\">{} frames of {}x{}, {} threads, {}; errors against f32</p>",
+        v["frames"],
+        v["width"],
+        v["height"],
+        v["threads"],
+        escape(
+            &[&v["network"], &v["machine"]["cpu"], &v["machine"]["date"]].map(|t| t.as_str().unwrap_or("?")).join(", ")
+        )
+    );
+    let mut out = facts + &table(&heads, &ran.iter().map(row).collect::<Vec<_>>()) + "<h3>Median</h3>";
+    out += &bars(&ran.iter().map(bar).collect::<Vec<_>>());
+    for r in results.iter().filter(|r| !r["median_ms"].is_number()) {
+        let why = r["failure"].as_str().unwrap_or("did not run");
+        let _ = write!(out, "<p class=\"quiet\">{}: {}</p>", escape(&name(r)), escape(why));
     }
     out
 }
@@ -458,6 +505,24 @@ mod tests {
             .filter_map(|(before, _)| before.rsplit("width=\"").next()?.trim_end_matches(['"', ' ']).parse().ok())
             .collect();
         assert!((widths[0] / widths[1] - 70.0 / 49.5).abs() < 0.01, "{widths:?}");
+    }
+
+    #[test]
+    fn peers_stand_side_by_side_and_those_that_cannot_say_why() {
+        let v = json!({"schema": "streetforward.peers/1", "network": "nano", "frames": 4, "width": 252, "height": 168,
+            "threads": 2, "machine": {"cpu": "C", "date": "D"}, "results": [
+                {"runtime": "StreetForward", "precision": "int8", "note": "", "median_ms": 50.0, "times_ours": 1.0,
+                 "round_low_ms": 49.0, "round_high_ms": 51.0, "cold_start_s": 0.1, "peak_rss_bytes": 1 << 25,
+                 "error": {"depth_absrel": 0.0021}},
+                {"runtime": "O<", "precision": "f32", "note": "n", "median_ms": 125.0, "times_ours": 2.5, "error": null},
+                {"runtime": "O<", "precision": "bf16", "note": "hint", "failure": "no such instructions"}]});
+        let text = document(&v, "p");
+        for part in
+            ["StreetForward int8", "O&lt; f32 (n)", "2.5", "2.10e-3", "32.00", "bf16 (hint): no such instructions"]
+        {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+        assert!(!text.contains("O<"), "{text}");
     }
 
     #[test]

@@ -356,3 +356,17 @@ fn plans_that_do_not_fit_are_told_and_fail() {
     fails(5, &["plan", "-m", s(&model), "--frames", "5000", "-q"]);
     fails(6, &["plan", "-m", "/nonexistent.sfw", "-q"]);
 }
+
+/// Steps of one new frame are timed beside runs of the whole window; that they have the same bits is checked by the command.
+#[test]
+fn pushes_are_timed_beside_the_whole_window() {
+    let (_dir, model) = workplace();
+    let args = ["bench", "-m", s(&model), "--size", "28x42", "--frames", "3", "--runs", "4", "--warmup", "1", "-q"];
+    let json = ok_json(&[&args[..], &["--push"]].concat());
+    let row = &json["results"][0];
+    assert_eq!(row["push_runs"], 4);
+    assert!(number(&row["push_p50_ms"]) > 0.0 && number(&row["push_whole_p50_ms"]) > 0.0);
+    assert!(ok_json(&args)["results"][0].get("push_runs").is_none());
+    assert!(ok(&[&args[..], &["--push"]].concat()).contains("one new frame a step"));
+    fails(2, &[&args[..], &["--push", "--period-ms", "10"]].concat());
+}

@@ -189,6 +189,42 @@ impl Pacer {
     }
 }
 
+/// Steps of one new frame beside runs of the whole window, in turn.
+pub(crate) struct Pushed {
+    /// `Session::push` on a full window.
+    pub(crate) push: Vec<Duration>,
+    /// `Session::run`.
+    pub(crate) whole: Vec<Duration>,
+}
+
+/// Pushes the clip's frames again and again, each step beside a run of the whole; the clip pushed frame by frame must give
+/// what the run gave, whose digest is `digest`.
+pub(crate) fn push(session: &mut Session, input: &Input, schedule: &Schedule, digest: Digest) -> Result<Pushed> {
+    let (n, len) = (input.shape.frames, input.shape.height * input.shape.width * 3);
+    for (image, &time) in input.images.chunks_exact(len).zip(input.times) {
+        session.push(image, time, None)?;
+    }
+    if output_digest(session.output()) != digest {
+        return Err(Error::Internal("a clip pushed frame by frame gave another result than the clip at once".into()));
+    }
+    let start = Instant::now();
+    let mut pushed = Pushed { push: Vec::new(), whole: Vec::new() };
+    let mut time = input.times[n - 1];
+    let wanted = schedule.runs.map_or(usize::MAX, |r| r as usize);
+    let late = || schedule.seconds.is_some_and(|s| start.elapsed().as_secs_f64() >= s);
+    while pushed.push.len() < wanted && (pushed.push.is_empty() || !late()) {
+        let frame = pushed.push.len() % n;
+        time += 0.1;
+        let clock = Instant::now();
+        session.push(&input.images[frame * len..][..len], time, None)?;
+        pushed.push.push(clock.elapsed());
+        let clock = Instant::now();
+        session.run(input)?;
+        pushed.whole.push(clock.elapsed());
+    }
+    Ok(pushed)
+}
+
 /// One run with every operation booked by kind, and its time.
 pub(crate) fn profile(session: &mut Session, input: &Input) -> Result<(Accounts, Duration)> {
     opclock::start();

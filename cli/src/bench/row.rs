@@ -46,6 +46,8 @@ pub(crate) struct Row {
     /// Place of the slowest run among those that count.
     pub(crate) worst_run: usize,
     pub(crate) profile: Option<(Accounts, Duration)>,
+    /// One new frame a step, and the whole window in between.
+    pub(crate) push: Option<(Samples, Samples)>,
     pub(crate) digest: Digest,
 }
 
@@ -146,6 +148,13 @@ impl Row {
             put("response_p50_ms", json!(self.responses.median()));
             put("response_p99_ms", json!(self.responses.percentile(Percentile(99.0))));
             put("response_max_ms", json!(self.responses.max()));
+        }
+        if let Some((push, whole)) = &self.push {
+            put("push_p50_ms", json!(push.median()));
+            put("push_p50_low_ms", json!(push.median_interval().map(|i| i.0)));
+            put("push_p50_high_ms", json!(push.median_interval().map(|i| i.1)));
+            put("push_whole_p50_ms", json!(whole.median()));
+            put("push_runs", json!(push.len()));
         }
         if let Some((deadline_ms, misses)) = self.deadline {
             put("deadline_ms", json!(deadline_ms));
@@ -288,6 +297,17 @@ pub(crate) fn tables(rows: &[Row], percentiles: &[Percentile]) -> String {
     for (i, row) in rows.iter().enumerate() {
         if row.pace.is_some() || row.deadline.is_some() {
             text.push_str(&format!("\nrow {}: {}\n", i + 1, row.pace_text()));
+        }
+        if let Some((push, whole)) = &row.push {
+            let times = [push, whole].map(|s| millis(Some(s.median())));
+            text.push_str(&format!(
+                "\nrow {}: one new frame a step {} ms, the whole window {} ms in between, {:.2} times; {} steps, same bits\n",
+                i + 1,
+                times[0],
+                times[1],
+                whole.median() / push.median(),
+                push.len(),
+            ));
         }
         if let Some((_, total)) = row.profile {
             let head = owned(&["operation", "calls", "ms", "share", "GOP", "GOP/s", "GB/s", "peak"]);

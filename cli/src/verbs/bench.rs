@@ -86,6 +86,9 @@ pub(crate) struct Args {
     /// Fail when a clip takes longer from its arrival to its result, in milliseconds
     #[arg(long, value_name = "MS", value_parser = positive)]
     deadline_ms: Option<f64>,
+    /// Also time steps of one new frame (Session::push) beside runs of the whole window, in half of the time
+    #[arg(long, conflicts_with = "period_ms")]
+    push: bool,
     /// Also time every kind of operation, in a run of its own
     #[arg(long)]
     profile_ops: bool,
@@ -240,6 +243,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
                             // What others left is shared by those that remain.
                             let used = (start.elapsed() - spent_loading).as_secs_f64();
                             let share = seconds.map(|s| (s - used).max(0.0) / left as f64);
+                            let share = share.map(|s| if args.push { s / 2.0 } else { s });
                             let schedule = Schedule {
                                 runs: args.runs,
                                 seconds: share,
@@ -393,6 +397,10 @@ impl Case<'_> {
             }
         };
         let measured = measure::measure(&mut session, &input, schedule, &mut tick)?;
+        let push = match self.args.push {
+            true => Some(measure::push(&mut session, &input, schedule, measured.digest)?),
+            false => None,
+        };
         let profile = if self.args.profile_ops { Some(measure::profile(&mut session, &input)?) } else { None };
         self.loaded.model.blob().unchanged()?;
 
@@ -440,6 +448,10 @@ impl Case<'_> {
             deadline: self.args.deadline_ms.map(|limit| (limit, misses)),
             worst_run: worst.map_or(0, |(i, _)| i + 1),
             profile,
+            push: push.map(|p| {
+                let samples = |times: Vec<Duration>| Samples::new(times.into_iter().map(ms).collect());
+                (samples(p.push), samples(p.whole))
+            }),
             digest: measured.digest,
         };
         Ok((row, measured))
