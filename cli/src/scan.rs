@@ -58,7 +58,7 @@ impl<'a> Judge<'a> {
     /// A model's outputs against the reference's.
     pub(crate) fn verdict(&mut self, model: &Arc<Model>) -> Result<Verdict> {
         let answers = versus::answers(model, &self.samples, self.engine, false)?;
-        versus::compare((&self.reference, &self.answers), (model, &answers), &mut self.renderer)
+        versus::compare(&self.samples, (&self.reference, &self.answers), (model, &answers), &mut self.renderer)
     }
 
     /// Converts with these options and judges the result.

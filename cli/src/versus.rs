@@ -64,6 +64,7 @@ pub(crate) struct Verdict {
 
 /// Compares B's answers with A's.
 pub(crate) fn compare(
+    samples: &[Sample],
     (model_a, a): (&Model, &Answers),
     (model_b, b): (&Model, &Answers),
     renderer: &mut Renderer,
@@ -74,7 +75,7 @@ pub(crate) fn compare(
     for i in 0..a.outputs.len() {
         let (out_a, out_b) = (&a.outputs[i], &b.outputs[i]);
         let (scene_a, scene_b) = (out_a.to_scene(model_a.config(), &[]), out_b.to_scene(model_b.config(), &[]));
-        comparison.add(&side(out_a, &scene_a), &side(out_b, &scene_b), renderer)?;
+        comparison.add(&side(out_a, &scene_a), &side(out_b, &scene_b), &samples[i].prepared.images, renderer)?;
         for ((name, width, a), (other, _, b)) in a.stages[i].iter().zip(&b.stages[i]) {
             if name != other || a.len() != b.len() {
                 return Err(Error::Internal(format!("stage {name} of A, {other} of B")));

@@ -17,6 +17,7 @@
 //! | `opacity_p99`, `colour_p99`, `scale_log_p99` | 99th percentiles of the differences of the Gaussians |
 //! | `render_psnr_db`, `render_psnr_dynamic_db`, `render_psnr_worst_db` | pictures of both scenes, each with its own cameras (as they are evaluated), at the frames' times and halfway between: all pixels, pixels dynamic in A (at the frames), the worst picture |
 //! | `render_psnr_fixed_db` | the same with A's cameras for both: errors of B's poses show as shifts |
+//! | `truth_psnr_fall`, `truth_psnr_dynamic_fall` | dB that B's pictures are farther than A's from the clip's own ones, mean over the frames: all pixels, pixels dynamic in A; below 0 where B is nearer |
 
 use crate::metrics;
 use glam::DVec3;
@@ -150,11 +151,14 @@ pub struct Comparison {
     dynamic: Picture,
     worst: Option<f64>,
     fixed: Picture,
+    /// dB to the clip's pictures, A's minus B's, one per frame: all pixels, dynamic ones.
+    fall: [Vec<f64>; 2],
 }
 
 impl Comparison {
-    /// Takes a clip in; both sides have the same frames and sizes.
-    pub fn add(&mut self, a: &Side, b: &Side, renderer: &mut Renderer) -> Result<()> {
+    /// Takes a clip in; both sides have the same frames and sizes. `pictures`: the clip's own, RGB bytes of all frames at
+    /// that size.
+    pub fn add(&mut self, a: &Side, b: &Side, pictures: &[u8], renderer: &mut Renderer) -> Result<()> {
         assert!(a.depth.len() == b.depth.len() && a.poses.len() == b.poses.len(), "sizes of the two sides");
         for (&a, &b) in a.depth.iter().zip(b.depth) {
             let (a, b) = (f64::from(a), f64::from(b));
@@ -177,7 +181,7 @@ impl Comparison {
                 self.scale.add((f64::from(b) / f64::from(a)).ln().abs());
             }
         }
-        self.add_pictures(a, b, renderer)
+        self.add_pictures(a, b, pictures, renderer)
     }
 
     fn add_cameras(&mut self, a: &Side, b: &Side) {
@@ -218,7 +222,7 @@ impl Comparison {
         }
     }
 
-    fn add_pictures(&mut self, a: &Side, b: &Side, renderer: &mut Renderer) -> Result<()> {
+    fn add_pictures(&mut self, a: &Side, b: &Side, pictures: &[u8], renderer: &mut Renderer) -> Result<()> {
         let frames = &a.scene.frames;
         let mut times: Vec<(f64, Option<usize>)> = frames.iter().enumerate().map(|(f, s)| (s.time, Some(f))).collect();
         times.extend(frames.windows(2).map(|pair| (0.5 * (pair[0].time + pair[1].time), None)));
@@ -245,6 +249,11 @@ impl Comparison {
             self.dynamic.add(Picture::of(&drawn[0], &drawn[1], moving));
             self.full.add(own);
             self.fixed.add(fixed);
+            if let Some(truth) = frame.and_then(|f| pictures.get(3 * f * pixels..3 * (f + 1) * pixels)) {
+                let falls =
+                    [fall((&drawn[0], &drawn[1]), truth, |_| true), fall((&drawn[0], &drawn[1]), truth, moving)];
+                self.fall.iter_mut().zip(falls).for_each(|(all, fall)| all.extend(fall));
+            }
             let db = own.db().unwrap_or(metrics::MAX_PSNR);
             self.worst = Some(self.worst.map_or(db, |w| w.min(db)));
         }
@@ -278,8 +287,27 @@ impl Comparison {
             ("render_psnr_dynamic_db", self.dynamic.db()),
             ("render_psnr_worst_db", self.worst),
             ("render_psnr_fixed_db", self.fixed.db()),
+            ("truth_psnr_fall", mean(&self.fall[0])),
+            ("truth_psnr_dynamic_fall", mean(&self.fall[1])),
         ]
     }
+}
+
+/// dB to the true picture, A's minus B's, over the pixels that `keep` takes.
+fn fall((a, b): (&Rendered, &Rendered), truth: &[u8], keep: impl Fn(usize) -> bool) -> Option<f64> {
+    let error = |drawn: &Rendered| {
+        let pairs = drawn.rgb.as_chunks::<3>().0.iter().zip(truth.as_chunks::<3>().0);
+        pairs.enumerate().filter(|(i, _)| keep(*i)).fold((0.0, 0u64), |(sum, n), (_, (have, want))| {
+            let of = |c: usize| (f64::from(have[c].clamp(0.0, 1.0)) - f64::from(want[c]) / 255.0).powi(2);
+            (sum + of(0) + of(1) + of(2), n + 3)
+        })
+    };
+    let db = |(sum, n): (f64, u64)| (n > 0).then(|| (-10.0 * (sum / n as f64).log10()).min(metrics::MAX_PSNR));
+    Some(db(error(a))? - db(error(b))?)
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 /// The value with at least `share` of the list at or below it.
@@ -300,7 +328,7 @@ pub struct Gate {
 }
 
 /// What an int8 model has to keep against its own f32 form.
-pub const INT8_GATES: [(&str, f64); 12] = [
+pub const INT8_GATES: [(&str, f64); 14] = [
     ("depth_absrel", 0.01),
     ("depth_log_rmse", 0.015),
     ("rotation_deg_median", 0.06),
@@ -313,6 +341,8 @@ pub const INT8_GATES: [(&str, f64); 12] = [
     ("render_psnr_db", 45.0),
     ("render_psnr_dynamic_db", 42.0),
     ("render_psnr_worst_db", 38.0),
+    ("truth_psnr_fall", 0.10),
+    ("truth_psnr_dynamic_fall", 0.15),
 ];
 
 impl Gate {
@@ -322,11 +352,11 @@ impl Gate {
     }
 
     /// The outputs' value over the limit (for decibels as a ratio of amplitudes): at most 1 passes. 0 where there is
-    /// nothing to measure; infinite for a value that is no number.
+    /// nothing to measure or B is the better one; infinite for a value that is no number.
     pub fn load(&self, outputs: &[(&'static str, Option<f64>)]) -> f64 {
         let Some(value) = outputs.iter().find(|(k, _)| *k == self.key).and_then(|(_, v)| *v) else { return 0.0 };
         let load = if self.at_least() { 10f64.powf((self.limit - value) / 20.0) } else { value / self.limit };
-        if load.is_nan() { f64::INFINITY } else { load }
+        if load.is_nan() { f64::INFINITY } else { load.max(0.0) }
     }
 
     /// As text: `depth_absrel <= 0.01`.
@@ -409,15 +439,27 @@ mod tests {
             ("render_psnr_db", Some(51.0)),
             ("velocity_epe", None),
             ("focal_rel", Some(f64::NAN)),
+            ("truth_psnr_fall", Some(-0.2)),
         ];
         let load = |key: &str, limit| Gate { key: key.into(), limit }.load(&outputs);
         assert_eq!(load("depth_absrel", 0.01), 0.5);
         assert!((load("render_psnr_db", 45.0) - 0.501).abs() < 1e-3);
         assert!(load("render_psnr_db", 57.1) > 1.99);
         assert_eq!((load("velocity_epe", 0.1), load("focal_rel", 0.1)), (0.0, f64::INFINITY));
+        assert_eq!(load("truth_psnr_fall", 0.1), 0.0);
         for (key, _) in INT8_GATES {
             assert!(Comparison::default().outputs().iter().any(|(k, _)| *k == key), "{key}");
         }
+    }
+
+    #[test]
+    fn a_picture_farther_from_the_truth_falls() {
+        let drawn = |v: f32| Rendered { rgb: vec![v; 6], ..Rendered::default() };
+        // Errors of 0.1 and 0.2 on a truth of 51 / 255 = 0.2: a factor of two is 6.02 dB.
+        let (a, b, truth) = (drawn(0.3), drawn(0.4), [51; 6]);
+        assert!((fall((&a, &b), &truth, |_| true).unwrap() - 6.0206).abs() < 1e-4);
+        assert!((fall((&b, &a), &truth, |i| i == 1).unwrap() + 6.0206).abs() < 1e-4);
+        assert_eq!(fall((&a, &b), &truth, |_| false), None);
     }
 
     #[test]

@@ -57,7 +57,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let answers_a = versus::answers(&a.model, &samples, &args.engine, stages)?;
     let answers_b = versus::answers(&b.model, &samples, &args.engine, stages)?;
     let mut renderer = Renderer::new(crate::args::threads(args.engine.threads))?;
-    let verdict = versus::compare((&a.model, &answers_a), (&b.model, &answers_b), &mut renderer)?;
+    let verdict = versus::compare(&samples, (&a.model, &answers_a), (&b.model, &answers_b), &mut renderer)?;
 
     let mut json = json!({
         "schema": "streetforward.compare/1",
