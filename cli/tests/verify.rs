@@ -85,6 +85,11 @@ fn a_blob_runs_alike_on_one_and_two_threads() {
     let file = file.to_str().unwrap();
     let json = ok_json(&["verify", "-m", file, "--run"]);
     assert_eq!(json["run_digest"].as_str().unwrap().len(), 64);
-    assert!(ok(&["verify", "-m", file, "--run"]).contains("on 1 and on 2 threads"));
+    assert!(ok(&["verify", "-m", file, "--run"]).contains("on 1, 2 threads"));
+    let more = ok_json(&["verify", "-m", file, "--run", "--threads", "1,3,8", "--repeat", "3", "--isa", "scalar"]);
+    assert_eq!((&more["run_digest"], more["isa"].as_str()), (&json["run_digest"], Some("scalar")));
+    fails(2, &["verify", "-m", file, "--threads", "2"]);
+    fails(2, &["verify", "-m", file, "--run", "--threads", "0"]);
+    fails(2, &["verify", "-m", file, "--run", "--repeat", "0"]);
     assert!(ok_json(&["verify", "-m", file])["run_digest"].is_null());
 }

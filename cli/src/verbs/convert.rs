@@ -1,7 +1,7 @@
 //! `convert`: training checkpoints to a weight blob.
 
 use crate::args::{EngineArgs, FileArgs, Precision, path_json};
-use crate::golden;
+use crate::golden::{self, How};
 use crate::network::{self, Preset, Watched};
 use crate::output::{Console, human_bytes, human_count};
 use crate::scan::{self, Judge};
@@ -129,7 +129,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let watched = Watched::new(&*source, &progress);
     let report = convert_checked(&watched, output, args.file.overwrite(), &options, |path, _| {
         let model = Arc::new(Model::from_blob(Blob::open(path, LoadMode::Map, Verify::Structure)?)?);
-        let mut found = vec![(keys::GOLDEN.to_string(), Setting::Text(hex(&golden::run(&model)?)))];
+        let mut found = vec![(keys::GOLDEN.to_string(), Setting::Text(hex(&golden::run(&model, &How::default())?)))];
         if let Some(judge) = &mut judge {
             let v = judge.verdict(&model)?;
             let failures = versus::failures(&gates, &v);

@@ -3,7 +3,7 @@
 //! Written tensor by tensor, so that the largest preset needs little memory.
 
 use crate::args::{FileArgs, Precision, has_extension, path_json};
-use crate::golden;
+use crate::golden::{self, How};
 use crate::network::{self, NetworkArgs};
 use crate::output::{Console, human_bytes, human_count};
 use crate::signals;
@@ -53,7 +53,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         let options = Options { command, golden: true, ..Options::to(args.to.dtype()) };
         convert_checked(&source, output, args.file.overwrite(), &options, |path, _| {
             let model = Arc::new(Model::from_blob(Blob::open(path, LoadMode::Map, Verify::Structure)?)?);
-            Ok(vec![(keys::GOLDEN.to_string(), Value::Text(hex(&golden::run(&model)?)))])
+            Ok(vec![(keys::GOLDEN.to_string(), Value::Text(hex(&golden::run(&model, &How::default())?)))])
         })?
         .blob_digest
     } else {
