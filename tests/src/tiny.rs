@@ -8,7 +8,7 @@ use sf_formats::config::{Head, Trunk};
 use sf_formats::meta::Meta;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use streetforward::{ClipShape, Input, Model, Options, Session, Tap};
+use streetforward::{ClipShape, Input, Model, Options, Output, Session, Tap};
 
 /// Tensors by name.
 pub type Tensors = BTreeMap<String, Vec<f32>>;
@@ -154,4 +154,16 @@ pub fn stages(model: &Arc<Model>, input: &Input) -> BTreeMap<String, Vec<f32>> {
     let mut tap = |tap: &Tap| map.entry(tap.name.to_string()).or_default().extend_from_slice(tap.data);
     session(model, input.shape).run_watched(input, None, Some(&mut tap)).unwrap();
     map
+}
+
+/// Everything that a run predicts for pixels and cameras, as bits.
+pub fn bits(out: &Output) -> Vec<u32> {
+    let lists = [&out.points, &out.mean, &out.scale, &out.colour, &out.v_fwd, &out.v_bwd];
+    let all = lists.into_iter().flat_map(|l| l.as_flattened()).chain(out.quat.as_flattened());
+    let all = all.chain(&out.depth).chain(&out.conf).chain(&out.opacity).chain(&out.dynamic);
+    let cameras = out.poses.iter().zip(&out.k).flat_map(|(pose, k)| {
+        let k = [k.fx, k.fy, k.cx, k.cy];
+        pose.to_rows().into_iter().flatten().chain(k).flat_map(|v| [v.to_bits() as u32, (v.to_bits() >> 32) as u32])
+    });
+    all.map(|v| v.to_bits()).chain(cameras).collect()
 }

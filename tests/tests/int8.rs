@@ -96,16 +96,12 @@ fn outliers_are_survived_at_full_depth() {
 }
 
 /// All predictions as bits.
-fn bits(model: &Arc<Model>, clip: &Frames, isa: Isa, threads: usize) -> Vec<u32> {
+fn bits_on(model: &Arc<Model>, clip: &Frames, isa: Isa, threads: usize) -> Vec<u32> {
     let options = Run { threads, isa: Some(isa), ..Run::default() };
     let mut session = Session::new(Arc::clone(model), clip.shape, options).unwrap();
     let mut first = Vec::new();
     for repeat in 0..2 {
-        let out = session.run(&clip.input()).unwrap();
-        let lists = [&out.points, &out.mean, &out.scale, &out.colour, &out.v_fwd, &out.v_bwd];
-        let all = lists.into_iter().flat_map(|l| l.as_flattened()).chain(out.quat.as_flattened());
-        let all = all.chain(&out.depth).chain(&out.conf).chain(&out.opacity).chain(&out.dynamic);
-        let all: Vec<u32> = all.map(|v| v.to_bits()).collect();
+        let all = sf_tests::tiny::bits(session.run(&clip.input()).unwrap());
         assert!(repeat == 0 || all == first, "repeat {repeat}");
         first = all;
     }
@@ -139,11 +135,11 @@ fn bits_of(config: &ModelConfig) {
     let tensors = tensors(config, 5);
     let model = converted(config, &tensors, Options::to(Dtype::Int8));
     let clip = Frames::new(2, 28, 42, 6);
-    let want = bits(&model, &clip, Isa::Scalar, 1);
+    let want = bits_on(&model, &clip, Isa::Scalar, 1);
     for isa in Isa::ALL {
         for threads in [1, 2, 3, 8] {
             match sf_ops::Kernels::capped(isa) {
-                Ok(_) => assert!(bits(&model, &clip, isa, threads) == want, "{isa:?} on {threads} threads"),
+                Ok(_) => assert!(bits_on(&model, &clip, isa, threads) == want, "{isa:?} on {threads} threads"),
                 Err(_) => println!("not run on this CPU: {isa:?}"),
             }
         }
