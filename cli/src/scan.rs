@@ -14,8 +14,9 @@ use sf_formats::blob::{Blob, LoadMode, Verify};
 use sf_formats::checkpoint::Checkpoint;
 use sf_formats::{Dtype, Error, ModelConfig, Result, arch};
 use sf_quant::work::multiply_adds;
-use sf_quant::{Options, Report, convert};
+use sf_quant::{Calibration, Options, Report, convert};
 use sf_splat::Renderer;
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use streetforward::Model;
@@ -163,6 +164,27 @@ fn work(config: &ModelConfig) -> BTreeMap<String, f64> {
 pub(crate) fn share(config: &ModelConfig, names: &[String]) -> f64 {
     let work = work(config);
     names.iter().filter_map(|n| work.get(n)).sum::<f64>() / work.values().sum::<f64>()
+}
+
+/// Runs clips through a checkpoint in f32 and gathers what its linear layers read.
+pub(crate) fn calibrate(
+    source: &dyn Checkpoint,
+    options: &Options,
+    clips: &[sf_formats::clip::Clip],
+    engine: &EngineArgs,
+) -> Result<Calibration> {
+    let folder = scratch_folder()?;
+    let plain = Options { precision: Dtype::F32, keep: Vec::new(), golden: false, ..options.clone() };
+    let reference = model(source, &folder, "calibration.sfw", &plain)?.0;
+    let calibration = RefCell::new(Calibration::default());
+    for sample in versus::samples(&reference, clips, None)? {
+        let mut session = crate::reconstruct::session_of(&reference, sample.prepared.shape, engine)?;
+        let see = |name: &str, row: &[f32]| calibration.borrow_mut().add(name, row);
+        session.run_observed(&sample.prepared.input(), &see)?;
+    }
+    let mut calibration = calibration.into_inner();
+    calibration.finish();
+    Ok(calibration)
 }
 
 /// A checkpoint as a model in a temporary file, which is gone from the folder at once.

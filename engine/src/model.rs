@@ -17,7 +17,8 @@ use std::sync::Arc;
 /// A matrix in panels, `[n, k]`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PanelRef {
-    tensor: usize,
+    /// Position in the blob.
+    pub(crate) tensor: usize,
     dtype: Dtype,
     /// Outputs.
     pub(crate) n: usize,
@@ -270,6 +271,17 @@ impl Model {
 
     pub(crate) fn weights(&self) -> &Weights {
         &self.weights
+    }
+
+    /// The names of all tensors, in the order of their positions.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let mut names = vec![String::new(); self.blob.tensors().len()];
+        for spec in sf_formats::arch::tensors(&self.config) {
+            if let Some(i) = self.blob.find(&spec.name) {
+                names[i] = spec.name;
+            }
+        }
+        names
     }
 
     /// The panels behind a handle.

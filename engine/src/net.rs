@@ -43,6 +43,8 @@ pub(crate) struct Net<'a> {
     pub(crate) ctx: Ctx<'a>,
     pub(crate) model: &'a Model,
     pub(crate) rows: &'a Rows,
+    /// Who looks at the input rows of linear layers; the number is that of the weight's tensor.
+    pub(crate) seen: Option<&'a dyn Fn(usize, &[f32])>,
 }
 
 /// A convolution with its surroundings.
@@ -124,6 +126,9 @@ impl Net<'_> {
     /// A layer of any precision; the norm in front only for int8.
     fn layer(&self, l: &Linear, norm: Option<&Norm>, x: Mat, ep: Epilogue, out: MatMut) {
         let ep = Epilogue { bias: l.bias.map(|b| self.model.values(b)), ..ep };
+        if let Some(seen) = self.seen {
+            (0..x.rows).for_each(|r| seen(l.weight.tensor, &x.data[r * x.stride..][..x.cols]));
+        }
         match self.model.weight(&l.weight) {
             Weight::Float(panels) => {
                 assert!(norm.is_none(), "a norm fused with a float layer");

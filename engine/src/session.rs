@@ -49,6 +49,9 @@ pub struct StageTime {
     pub time: Duration,
 }
 
+/// Who looks at the input rows of linear layers, by the number of the weight's tensor.
+type Seen<'a> = &'a dyn Fn(usize, &[f32]);
+
 /// A model ready to run clips of one shape.
 pub struct Session {
     model: Arc<Model>,
@@ -193,6 +196,24 @@ impl Session {
     ///
     /// After `deadline` the run stops at the next layer with status 8. A result is whole or absent.
     pub fn run_watched(&mut self, input: &Input, deadline: Option<Instant>, taps: Option<TapFn>) -> Result<&Output> {
+        self.run_seen(input, deadline, taps, None)
+    }
+
+    /// [`Session::run`] with a function that sees the input rows of every linear layer whose inputs exist as floats, all of
+    /// them in an f32 or f16 model, with the name of the weight: what the rounding of weights is calibrated with.
+    /// Convolutions are not shown.
+    pub fn run_observed(&mut self, input: &Input, seen: &dyn Fn(&str, &[f32])) -> Result<&Output> {
+        let names = self.model.names();
+        self.run_seen(input, None, None, Some(&|tensor: usize, row: &[f32]| seen(&names[tensor], row)))
+    }
+
+    fn run_seen(
+        &mut self,
+        input: &Input,
+        deadline: Option<Instant>,
+        taps: Option<TapFn>,
+        seen: Option<Seen>,
+    ) -> Result<&Output> {
         if input.shape != self.plan.shape() {
             let (have, want) = (input.shape, self.plan.shape());
             if have.frames > want.frames {
@@ -209,7 +230,7 @@ impl Session {
         let _mode = DefaultFloatMode::enter();
         self.times = Default::default();
         self.layers.store(0, Ordering::Relaxed);
-        self.forward(input, None, deadline, taps)?;
+        self.forward(input, None, (deadline, taps, seen))?;
         Ok(&self.memory.output)
     }
 
@@ -217,11 +238,11 @@ impl Session {
         &mut self,
         input: &Input,
         encoded: Option<&[f32]>,
-        deadline: Option<Instant>,
-        taps: Option<TapFn>,
+        (deadline, taps, seen): (Option<Instant>, Option<TapFn>, Option<Seen>),
     ) -> Result<()> {
         let [pairs, guide, motion, work] = carve(self.arena.all(), self.plan.areas);
-        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows };
+        let net =
+            Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows, seen };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline };
         let mut probe = Probe::new(taps, watch, &mut self.times);
@@ -264,7 +285,7 @@ impl Session {
                 return Ok(false);
             }
             let input = Input { shape, images: &window.images, times: &window.times, k };
-            self.forward(&input, Some(&window.tokens), None, None).map(|()| true)
+            self.forward(&input, Some(&window.tokens), (None, None, None)).map(|()| true)
         });
         self.window = Some(window);
         Ok(result?.then_some(&self.memory.output))
@@ -281,7 +302,12 @@ impl Session {
 
     fn encode(&mut self, image: &[u8], window: &mut Window) -> Result<()> {
         let [_, _, _, work] = carve(self.arena.all(), self.plan.areas);
-        let net = Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows };
+        let net = Net {
+            ctx: Ctx { pool: &self.pool, kernels: self.kernels },
+            model: &self.model,
+            rows: &self.rows,
+            seen: None,
+        };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline: None };
         let mut probe = Probe::new(None, watch, &mut self.times);
         forward::encode_frame(net, &self.plan, &self.tables, image, (work, &mut window.newest), &mut probe)

@@ -34,6 +34,8 @@ pub mod keys {
     pub const CHECK_VALUES: &str = "check.values";
     /// What the quantizer did, in words.
     pub const QUANT_RECIPE: &str = "quant.recipe";
+    /// SHA-256, hexadecimal, of the moments of layers' inputs that the rounding was calibrated with.
+    pub const CALIBRATION: &str = "quant.calibration";
     /// One line per matrix that is not int8: name, type, reason.
     pub const QUANT_KEPT: &str = "quant.kept";
     /// Signal to error of the stored weights in dB, one number per matrix in the order of the file.

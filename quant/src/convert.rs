@@ -4,6 +4,7 @@
 //! `recipe.rs`; a matrix with a value beyond the range of f16 becomes f32 instead, and one whose int8 weights
 //! do not reach [`WEIGHT_FLOOR_DB`] becomes f16.
 
+use crate::calibrate::Calibration;
 use crate::detect::detect;
 use crate::names::{Names, WRAPPERS, nearest, resolve};
 use crate::quantize::{self, EXACT_DB, Fold, Quantized, sqnr_db};
@@ -22,6 +23,7 @@ use sf_formats::sniff::FileKind;
 use sf_formats::{Dtype, Error, Result};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::sync_channel;
 
 /// What to convert to.
@@ -33,6 +35,8 @@ pub struct Options {
     pub keep: Vec<(String, Dtype)>,
     /// Names of matrices that int8 is too coarse for: stored as f16.
     pub promoted: Vec<String>,
+    /// What the layers' inputs look like, for the rounding of int8 weights and their biases.
+    pub calibration: Option<Arc<Calibration>>,
     /// Whether the blob gets a place for the digest of a golden run ([`keys::GOLDEN`]), which the caller fills in.
     pub golden: bool,
     /// Names of measurements for which the blob gets places ([`keys::CHECK_VALUES`]), which the caller fills in.
@@ -54,6 +58,7 @@ impl Options {
             precision,
             keep: Vec::new(),
             promoted: Vec::new(),
+            calibration: None,
             golden: false,
             checks: Vec::new(),
             config: None,
@@ -118,7 +123,7 @@ pub fn convert_to_bytes(source: &dyn Checkpoint, options: &Options) -> Result<Ve
     let (mut report, jobs) = prepare(source, &at, options)?;
     let meta = provenance(source, options, &mut report)?;
     let mut writer = BlobWriter::in_memory(&report.config, &meta)?;
-    stream((source, &at), &jobs, &mut writer, &mut report)?;
+    stream((source, &at), (&jobs, options), &mut writer, &mut report)?;
     writer.finish_bytes()
 }
 
@@ -152,7 +157,7 @@ fn convert_at(
     drop(AtomicFile::create(output, overwrite)?);
     let meta = provenance(source, options, &mut report)?;
     let mut writer = BlobWriter::create(output, overwrite, &report.config, &meta)?;
-    stream((source, at), &jobs, &mut writer, &mut report)?;
+    stream((source, at), (&jobs, options), &mut writer, &mut report)?;
     let digest = writer.finish_checked(|path| check(path, &report))?;
     report.blob_digest = Some(digest);
     Ok(report)
@@ -469,6 +474,9 @@ fn provenance(source: &dyn Checkpoint, options: &Options, report: &mut Report) -
     }
     if options.precision == Dtype::Int8 {
         meta.set_text(keys::QUANT_RECIPE, RECIPE);
+        if let Some(calibration) = &options.calibration {
+            meta.set_text(keys::CALIBRATION, &hex(&calibration.digest()));
+        }
         let kept = report.tensors.iter().filter_map(|t| t.reason.as_ref().map(|why| (t, why)));
         let lines: Vec<String> = kept.map(|(t, why)| format!("{} {} {why}", t.name, t.dtype.name())).collect();
         meta.set_text(keys::QUANT_KEPT, &lines.join("\n"));
@@ -487,7 +495,7 @@ struct Loaded {
 /// Reads on one thread, quantizes, packs and writes on the others; at most three tensors are in memory.
 fn stream(
     (source, at): (&dyn Checkpoint, &str),
-    jobs: &[Job],
+    (jobs, options): (&[Job], &Options),
     writer: &mut BlobWriter,
     report: &mut Report,
 ) -> Result<()> {
@@ -511,6 +519,8 @@ fn stream(
             .map_err(|e| Error::resource(at, format!("cannot start the reading thread: {e}")))?;
         // The matrix before, for its bias.
         let mut last: Option<(&TensorSpec, Loaded)> = None;
+        // Of the matrix before: what its rounding adds to its bias.
+        let mut shift: Option<(&str, Vec<f64>)> = None;
         for (job, row) in jobs.iter().zip(&mut report.tensors) {
             let mut loaded = receive.recv().map_err(|_| Error::Internal("the reading thread ended early".into()))??;
             row.zero_outputs = zero_outputs(&job.spec, &loaded.values);
@@ -523,8 +533,14 @@ fn stream(
                 }
                 Fate::Folded(_) | Fate::Plain => {}
             }
+            if let Some((_, shift)) =
+                shift.take().filter(|(layer, _)| job.spec.name.strip_suffix("bias") == Some(layer))
+            {
+                loaded.values.iter_mut().zip(shift).for_each(|(b, s)| *b = (f64::from(*b) + s) as f32);
+            }
             if job.dtype == Dtype::Int8 {
-                write_int8(job, &loaded, writer, row)?;
+                let found = write_int8(job, &loaded, options.calibration.as_deref(), writer, row)?;
+                shift = job.spec.name.strip_suffix("weight").zip(found);
             } else {
                 write_float(&loaded.values, job.dtype, writer, row)?;
                 if int8 && job.spec.matrix().is_some() {
@@ -549,19 +565,26 @@ fn write_float(values: &[f32], dtype: Dtype, writer: &mut BlobWriter, row: &mut 
     Ok(())
 }
 
-/// Writes a matrix as int8, or (folded all the same) as f16 where int8 would be too coarse.
-fn write_int8(job: &Job, loaded: &Loaded, writer: &mut BlobWriter, row: &mut TensorReport) -> Result<()> {
-    let q: Quantized = quantize::quantize(&job.spec, &loaded.values, &loaded.fold, recipe::is_rotated(&job.spec));
+/// Writes a matrix as int8, or (folded all the same) as f16 where int8 would be too coarse. What the bias gains.
+fn write_int8(
+    job: &Job,
+    loaded: &Loaded,
+    calibration: Option<&Calibration>,
+    writer: &mut BlobWriter,
+    row: &mut TensorReport,
+) -> Result<Option<Vec<f64>>> {
+    let rotated = recipe::is_rotated(&job.spec);
+    let q: Quantized = quantize::quantize(&job.spec, &loaded.values, &loaded.fold, rotated, calibration);
     row.sqnr_db = Some(q.sqnr_db());
     if q.sqnr_db() >= WEIGHT_FLOOR_DB || q.signal == 0.0 {
         row.bytes = writer.write_int8(QuantizedMatrix { values: &q.values, scales: &q.scales, signs: &q.signs })?;
-        return Ok(());
+        return Ok(Some(q.shift));
     }
     row.reason = Some(format!("int8 weights reach only {:.1} dB", q.sqnr_db()));
     let folded = quantize::folded(&job.spec, &loaded.values, &loaded.fold);
     write_float(&folded, Dtype::F16, writer, row)?;
     row.sqnr_db = Some(float_sqnr(&folded, row.dtype));
-    Ok(())
+    Ok(None)
 }
 
 /// Signal to error of values stored as floats.

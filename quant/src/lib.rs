@@ -5,6 +5,7 @@
 //! | `convert.rs` | [`convert()`]: a checkpoint to a `.sfw` blob, streaming |
 //! | `recipe.rs` | which matrix gets which type, what is folded into it |
 //! | `quantize.rs` | one matrix to int8: folding, rotation, step, rounding |
+//! | `calibrate.rs` | rounding that knows the inputs, from clips |
 //! | `work.rs` | multiply-adds of a matrix |
 //! | `names.rs` | wrapper prefixes, VGGT's names, nearest names |
 //! | `detect.rs` | a configuration from names and shapes |
@@ -30,6 +31,7 @@
 //! ```
 #![deny(unsafe_code)]
 
+pub mod calibrate;
 pub mod convert;
 mod detect;
 pub mod names;
@@ -41,6 +43,7 @@ mod safetensors_out;
 pub mod seeded;
 pub mod work;
 
+pub use calibrate::Calibration;
 pub use convert::{Options, convert, convert_checked, convert_files, convert_to_bytes, parse_keep, plan, plan_files};
 pub use report::Report;
 pub use safetensors_out::write_safetensors;

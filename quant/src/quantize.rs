@@ -3,6 +3,7 @@
 //! Row o of the stored matrix is round(w / s), w = R (gamma_o * W_o * gain), s the step that gives the smallest
 //! squared error (`best_scale`). Rounding is to nearest, ties to even; values stay in [-127, 127].
 
+use crate::calibrate::{Calibration, Metric};
 use crate::rng::Stream;
 use rayon::prelude::*;
 use sf_formats::arch::TensorSpec;
@@ -47,6 +48,8 @@ pub struct Quantized {
     pub signal: f64,
     /// Sum of the squared errors.
     pub noise: f64,
+    /// `[n]`: what the bias gains; zeros without calibration.
+    pub shift: Vec<f64>,
 }
 
 impl Quantized {
@@ -108,35 +111,69 @@ pub fn folded_bias(spec: &TensorSpec, weight: &[f32], fold: &Fold, bias: &[f32])
 }
 
 /// Quantizes a matrix; `values` in checkpoint order. With a rotation its input width must have one
-/// ([`rotation_block`]).
+/// ([`rotation_block`]). A calibration that has seen the layer rounds for the smallest error of its outputs.
 ///
 /// Rows are independent: any number of threads gives the same result.
-pub fn quantize(spec: &TensorSpec, values: &[f32], fold: &Fold, rotated: bool) -> Quantized {
+pub fn quantize(
+    spec: &TensorSpec,
+    values: &[f32],
+    fold: &Fold,
+    rotated: bool,
+    calibration: Option<&Calibration>,
+) -> Quantized {
     let order = Order::of(spec).unwrap_or_else(|| panic!("{} is no matrix", spec.name));
     let (n, k) = spec.matrix().expect("as above");
     let width = rotated_width(spec).expect("a matrix has inputs");
     assert!(!rotated || rotation_block(width).is_some(), "a rotation of the inputs of {} {:?}", spec.name, spec.shape);
     let signs = if rotated { signs(width) } else { Vec::new() };
+    // Only linear layers are observed, whose inputs are as wide as the matrix.
+    let metric = calibration.filter(|_| k == width).and_then(|c| c.metric(&spec.name, fold, &signs));
     let (mut out, mut scales) = (vec![0i8; n * k], vec![0.0f32; n]);
-    let sums: Vec<(f64, f64)> = (out.par_chunks_exact_mut(k), scales.par_iter_mut())
+    let sums: Vec<(f64, f64, f64)> = (out.par_chunks_exact_mut(k), scales.par_iter_mut())
         .into_par_iter()
         .enumerate()
         .map_init(
-            || vec![0.0f64; k],
-            |row, (o, (to, scale))| {
+            || (vec![0.0f64; k], vec![0.0f64; k]),
+            |(row, left), (o, (to, scale))| {
                 folded_row(values, &order, fold, o, row);
                 if rotated {
                     row.chunks_exact_mut(width).for_each(|channels| rotate(channels, &signs));
                 }
                 let (best, signal, noise) = quantize_row(row, to);
                 *scale = best;
-                (signal, noise)
+                match &metric {
+                    Some(metric) if noise < signal => {
+                        let (noise, shift) = calibrated_row(metric, row, (to, scale), left);
+                        (signal, noise, shift)
+                    }
+                    _ => (signal, noise, 0.0),
+                }
             },
         )
         .collect();
     // In order: the sum does not depend on the threads.
-    let (signal, noise) = sums.iter().fold((0.0, 0.0), |(s, e), (a, b)| (s + a, e + b));
-    Quantized { values: out, scales, signs, signal, noise }
+    let (signal, noise) = sums.iter().fold((0.0, 0.0), |(s, e), (a, b, _)| (s + a, e + b));
+    Quantized { values: out, scales, signs, signal, noise, shift: sums.into_iter().map(|s| s.2).collect() }
+}
+
+/// Shares of a row's least-squares step that are tried with the inputs in mind: rounding that makes up for errors may use
+/// a finer or coarser grid.
+const STEPS: [f64; 3] = [1.0, 0.9, 1.1];
+
+/// Replaces a row's integers and step by those of the smallest error of the outputs; (squared error of the weights, what
+/// the bias gains).
+fn calibrated_row(metric: &Metric, row: &[f64], (to, scale): (&mut [i8], &mut f32), left: &mut [f64]) -> (f64, f64) {
+    let first = *scale;
+    let mut best = f64::INFINITY;
+    for share in STEPS {
+        let step = (f64::from(first) * share) as f32;
+        let error = metric.round(row, f64::from(step), |v| round(v.clamp(-TOP, TOP)), to, left);
+        if error < best {
+            (best, *scale) = (error, step);
+        }
+    }
+    metric.round(row, f64::from(*scale), |v| round(v.clamp(-TOP, TOP)), to, left);
+    (left.iter().map(|e| e * e).sum(), metric.shift(left))
 }
 
 /// Rounds to nearest, ties to even, without the library: |x| must be below 2^51.
@@ -241,7 +278,7 @@ mod tests {
             let w = random(n * k, "w");
             let (gain, offset, gamma) = (random(k, "gain"), random(k, "offset"), random(n, "gamma"));
             let fold = Fold { gain: Some(gain.clone()), offset: Some(offset.clone()), gamma: Some(gamma.clone()) };
-            let q = quantize(&spec, &w, &fold, true);
+            let q = quantize(&spec, &w, &fold, true, None);
             let bias = random(n, "bias");
             let folded = folded_bias(&spec, &w, &fold, &bias);
             let order = Order::of(&spec).unwrap();

@@ -53,6 +53,12 @@ pub(crate) struct Args {
     /// Text file with the licence of the weights, for the blob
     #[arg(long, value_name = "FILE")]
     licence: Option<PathBuf>,
+    /// Clips whose inputs to the layers the rounding of int8 weights is made for; others than those of --check
+    #[arg(long, value_name = "CLIP", num_args = 1..)]
+    calib: Vec<PathBuf>,
+    /// Pictures of every clip of --calib and --check to use, from 0, as 0,5,10,15; default: all
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    frames: Option<Vec<usize>>,
     /// Clips on which the result must keep up with the f32 model: no blob (exit code 1) when it does not. An int8
     /// model that does not is scanned, and its most sensitive layers become f16, up to 5 % of the multiply-adds
     #[arg(long, value_name = "CLIP", num_args = 1..)]
@@ -107,10 +113,19 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     drop(AtomicFile::create(output, args.file.overwrite())?);
     signals::guard_file(output);
     let gates = args.gate.concat();
+    let clip_options = ClipOptions { frames: args.frames.clone(), ..ClipOptions::default() };
+    let open =
+        |paths: &[PathBuf]| -> Result<Vec<Clip>> { paths.iter().map(|p| Clip::open(p, &clip_options)).collect() };
+    if !args.calib.is_empty() {
+        if args.to != Precision::Int8 {
+            return Err(Error::usage("--calib is for --to int8"));
+        }
+        let calibration = scan::calibrate(&*source, &options, &open(&args.calib)?, &args.engine)?;
+        options.calibration = Some(Arc::new(calibration));
+    }
     let mut judge = None;
     if !args.check.is_empty() {
-        let clips: Vec<Clip> =
-            args.check.iter().map(|p| Clip::open(p, &ClipOptions::default())).collect::<Result<_>>()?;
+        let clips = open(&args.check)?;
         let mut j = Judge::new(&*source, &options, &clips, &args.engine)?;
         if args.to == Precision::Int8 {
             options.promoted = match j.scan(&options, &gates, console) {
