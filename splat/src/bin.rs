@@ -70,7 +70,7 @@ impl KeyForm {
     #[inline(always)]
     pub fn blocks(self, key: u64, look: impl FnOnce() -> u64) -> u64 {
         match self {
-            KeyForm::Short => Rect::unpack(key as u32 & ((1 << Self::RECT_BITS) - 1)).blocks(),
+            KeyForm::Short => Rect::blocks_of(key as u32 & ((1 << Self::RECT_BITS) - 1)),
             KeyForm::Long => look(),
         }
     }
@@ -195,6 +195,14 @@ mod tests {
                 assert_eq!(form.blocks(*key, || rect.blocks()), rect.blocks());
             }
         }
+        for y in 0..8 {
+            for x in 0..8 {
+                let inside = (1..=6).contains(&x) && y <= 7;
+                assert_eq!(rect.blocks() >> (8 * y + x) & 1 == 1, inside, "block ({x}, {y})");
+            }
+        }
+        assert_eq!(Rect { x: (7, 7), y: (7, 7) }.blocks(), 1 << 63);
+        assert_eq!(Rect { x: (2, 3), y: (0, 1) }.blocks(), 0xc0c);
         assert_eq!(KeyForm::of(2 << 20), KeyForm::Short);
         assert_eq!(KeyForm::of((2 << 20) + 1), KeyForm::Long);
     }

@@ -160,8 +160,8 @@ pub struct Shared<'a> {
 
 impl Shared<'_> {
     #[inline(always)]
-    fn record(&self, key: u64) -> &Record {
-        let (group, record) = self.form.locate(key);
+    fn record(&self, form: KeyForm, key: u64) -> &Record {
+        let (group, record) = form.locate(key);
         &self.records[group][record]
     }
 }
@@ -223,8 +223,24 @@ impl Tile {
         shared: &Shared,
         draw: &mut D,
     ) {
+        // A form known to the compiler: keys are taken apart several times each.
+        match shared.form {
+            KeyForm::Short => self.each_chunk_of(KeyForm::Short, s, (place, lists), shared, draw),
+            KeyForm::Long => self.each_chunk_of(KeyForm::Long, s, (place, lists), shared, draw),
+        }
+    }
+
+    #[inline(always)]
+    fn each_chunk_of<S: Simd, D: Draw>(
+        &mut self,
+        form: KeyForm,
+        s: S,
+        (place, lists): (Place, &[&[u64]; bin::GROUPS]),
+        shared: &Shared,
+        draw: &mut D,
+    ) {
         let tile = self;
-        let (form, first) = (shared.form, (place.x, place.y));
+        let first = (place.x, place.y);
         let buckets = tile.split(lists, form);
         // Kept keys move to the front of the list, in order; `dealt..kept` wait for their records.
         let (mut dealt, mut kept) = (0, 0);
@@ -233,7 +249,7 @@ impl Tile {
             let sorted = kept;
             for i in start..end {
                 let key = tile.keys[i];
-                let mask = form.blocks(key, || shared.record(key).blocks(first));
+                let mask = form.blocks(key, || shared.record(form, key).blocks(first));
                 tile.keys[kept] = key;
                 kept += usize::from(mask & tile.alive != 0);
             }
@@ -241,10 +257,10 @@ impl Tile {
             // Records lie in index order and are wanted in depth order: nearly every one is a cache miss, so all
             // of a chunk are on their way before the first is read.
             for &key in &tile.keys[sorted..kept] {
-                prefetch(shared.record(key));
+                prefetch(shared.record(form, key));
             }
             while kept - dealt >= CHUNK {
-                tile.deal_keys(place, shared, dealt..dealt + CHUNK);
+                tile.deal_keys(form, place, shared, dealt..dealt + CHUNK);
                 draw.draw(s, tile, shared, dealt..dealt + CHUNK);
                 tile.empty_chunk();
                 dealt += CHUNK;
@@ -253,7 +269,7 @@ impl Tile {
                 }
             }
         }
-        tile.deal_keys(place, shared, dealt..kept);
+        tile.deal_keys(form, place, shared, dealt..kept);
         draw.draw(s, tile, shared, dealt..kept);
         tile.empty_chunk();
     }
@@ -337,13 +353,13 @@ impl Tile {
 
     /// Deals at most [`CHUNK`] keys of the ordered list.
     #[inline(always)]
-    fn deal_keys(&mut self, place: Place, shared: &Shared, keys: Range<usize>) {
+    fn deal_keys(&mut self, form: KeyForm, place: Place, shared: &Shared, keys: Range<usize>) {
         for i in keys.clone() {
             // Again, for those that the first hint lost.
-            prefetch(shared.record(self.keys[(i + AHEAD).min(keys.end - 1)]));
+            prefetch(shared.record(form, self.keys[(i + AHEAD).min(keys.end - 1)]));
             let key = self.keys[i];
-            let record = shared.record(key);
-            self.deal(record, place, shared.form.blocks(key, || record.blocks((place.x, place.y))));
+            let record = shared.record(form, key);
+            self.deal(record, place, form.blocks(key, || record.blocks((place.x, place.y))));
         }
     }
 

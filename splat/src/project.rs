@@ -96,21 +96,37 @@ impl Rect {
         u32::from(self.x.0) | u32::from(self.x.1) << 3 | u32::from(self.y.0) << 6 | u32::from(self.y.1) << 9
     }
 
-    /// From 12 bits.
-    #[inline(always)]
-    pub fn unpack(bits: u32) -> Rect {
-        let three = |shift: u32| (bits >> shift & 7) as u8;
-        Rect { x: (three(0), three(3)), y: (three(6), three(9)) }
-    }
-
     /// Bit `8 row + column` set for every block.
     #[inline(always)]
     pub fn blocks(self) -> u64 {
-        let columns = (2u64 << self.x.1) - (1 << self.x.0);
-        let rows =
-            (u64::MAX >> (56 - 8 * (self.y.1 - self.y.0) as u32) & 0x0101_0101_0101_0101) << (8 * u32::from(self.y.0));
-        columns * rows
+        Self::blocks_of(self.pack())
     }
+
+    /// [`Rect::blocks`] of 12 bits.
+    #[inline(always)]
+    pub fn blocks_of(bits: u32) -> u64 {
+        // Columns in the low byte times rows as ones eight bits apart.
+        COLUMNS[bits as usize % 64] * ROWS[bits as usize / 64 % 64]
+    }
+}
+
+/// Bits `lo..=hi` for every `lo | hi << 3`.
+const COLUMNS: [u64; 64] = spans(1);
+/// Bits `8 lo, 8 lo + 8, ..= 8 hi`.
+const ROWS: [u64; 64] = spans(8);
+
+const fn spans(apart: usize) -> [u64; 64] {
+    let mut table = [0; 64];
+    let mut i = 0;
+    while i < 64 {
+        let mut bit = i % 8;
+        while bit <= i / 8 {
+            table[i] |= 1 << (bit * apart);
+            bit += 1;
+        }
+        i += 1;
+    }
+    table
 }
 
 /// What binning needs of a record, packed: the records themselves are read only where they are drawn.
