@@ -1,6 +1,7 @@
 //! Times the renderer on a procedural street: milliseconds beside the counts that explain them.
 //!
-//! `cargo run --release -p sf-splat --example rates -- [repeats] [threads]`
+//! `cargo run --release -p sf-splat --example rates -- [repeats] [threads]`, or `-- ply FOLDER`, which writes the two streets for other
+//! renderers and measures nothing.
 //!
 //! With one thread on Linux the processor's own time is shown too: what other programs take does not count there.
 //!
@@ -8,6 +9,8 @@
 
 use std::time::Instant;
 
+use sf_formats::atomic::Overwrite;
+use sf_formats::ply::export_ply;
 use sf_formats::scene::SplatSettings;
 use sf_splat::{RenderOptions, Rendered, Renderer};
 use street::{STEP, camera, scene};
@@ -15,14 +18,25 @@ use street::{STEP, camera, scene};
 #[path = "../tests/common/street.rs"]
 mod street;
 
+/// Sizes of the source frames.
+const SOURCES: [(u32, u32); 2] = [(252, 168), (518, 280)];
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut args = std::env::args().skip(1);
+    if args.next().as_deref() == Some("ply") {
+        let folder = std::path::PathBuf::from(args.next().ok_or("ply FOLDER")?);
+        for (width, height) in SOURCES {
+            export_ply(&scene(width, height), &folder.join(format!("{width}x{height}.ply")), Overwrite::Yes)?;
+        }
+        return Ok(());
+    }
     let mut numbers = std::env::args().skip(1).map(|a| a.parse::<usize>());
     let repeats = numbers.next().transpose()?.unwrap_or(50).max(1);
     let threads = numbers.next().transpose()?.unwrap_or(2);
     let mut renderer = Renderer::new(threads)?;
     println!("| Gaussians | view | median ms | least ms | least CPU ms | visible | entries | block updates |");
     println!("|---|---|---|---|---|---|---|---|");
-    for source in [(252, 168), (518, 280)] {
+    for source in SOURCES {
         let scene = scene(source.0, source.1);
         for (width, height) in [(252, 168), (518, 280), (1280, 720)] {
             let view = camera(width, height, 1.5 * STEP);
