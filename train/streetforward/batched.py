@@ -36,6 +36,7 @@ class Raw:
     gs: torch.Tensor | None = None
     motion: dict = field(default_factory=dict)
     kept: list = field(default_factory=list)  # (name, queries, keys) [B, F, P, d] of attention heads under supervision
+    tokens: dict = field(default_factory=dict)  # patch tokens [B, F, P, C] after the layers that answer for displacement
 
     def log_depth(self, config):
         """[rows, H, W]"""
@@ -95,10 +96,11 @@ def full(x):
     return x.float() if x.dtype == torch.bfloat16 else x
 
 
-def forward_clips(model, images, times, wanted, keep=()):
+def forward_clips(model, images, times, wanted, keep=(), tokens_of=()):
     """images [B, F, H, W, 3] in 0..1, times f64 [B, F].
 
-    `keep` names attention modules ("decoder.1", "causal.0") whose first head's queries and keys come back.
+    `keep` names attention modules ("decoder.1", "causal.0") whose first head's queries and keys come back, `tokens_of`
+    layers ("decoder.5", "causal.1": both passes) whose patch tokens do.
     """
     config = model.config
     batch, frames, height, width, _ = images.shape
@@ -155,6 +157,12 @@ def forward_clips(model, images, times, wanted, keep=()):
     if wanted.motion is not None:
         for way, outputs in causal_clips(model, layers, time, batch, frames, grid, raw.kept).items():
             raw.motion[way] = dense("motion", "motion", outputs, wanted.motion[way], 0)
+            for i, output in enumerate(outputs):
+                if f"causal.{i}" in tokens_of:
+                    raw.tokens[f"causal.{way}.{i}"] = output.unflatten(0, (batch, frames))
+    for i, layer in enumerate(layers):
+        if f"decoder.{i}" in tokens_of:
+            raw.tokens[f"decoder.{i}"] = layer[:, registers:].unflatten(0, (batch, frames))
     for name in keep:
         attention = model.get_submodule(name).attn
         attention.keep = False

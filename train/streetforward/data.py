@@ -48,6 +48,7 @@ class Chunks:
 
     def __init__(self, generator, folder, split, width, height, frames=4, stride=None, count=CHUNK, threads=1):
         self.generator, self.split, self.size, self.threads = Path(generator), split, (width, height), threads
+        self.frames = frames
         self.count = count  # clips of a chunk
         self.timing = [] if stride is None else [frames, stride]  # without a stride each seed has its own
         self.dtype = record_dtype(frames, height, width)

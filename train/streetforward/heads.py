@@ -206,6 +206,8 @@ class DptHead(nn.Module):
 class CameraUnit(nn.Module):
     """x + relu(L3 relu(L2 relu(L1 x)))."""
 
+    slope = 0.0  # see CameraHead
+
     def __init__(self, width):
         super().__init__()
         self.res_conv1 = nn.Linear(width, width)
@@ -213,13 +215,19 @@ class CameraUnit(nn.Module):
         self.res_conv3 = nn.Linear(width, width)
 
     def forward(self, x):
-        y = F.relu(self.res_conv1(x))
-        y = F.relu(self.res_conv2(y))
-        return x + F.relu(self.res_conv3(y))
+        y = F.leaky_relu(self.res_conv1(x), self.slope)
+        y = F.leaky_relu(self.res_conv2(y), self.slope)
+        return x + F.leaky_relu(self.res_conv3(y), self.slope)
 
 
 class CameraHead(nn.Module):
-    """Patch tokens [F, P, width] to translation [F, 3], rotation numbers [F, 9] and, if asked, field of view [F, 2]."""
+    """Patch tokens [F, P, width] to translation [F, 3], rotation numbers [F, 9] and, if asked, field of view [F, 2].
+
+    The network's units are ReLU, `slope` 0. Training may let negative inputs leak for a while: behind the average over
+    patches most units would otherwise be off for all frames, with no gradient to come back.
+    """
+
+    slope = 0.0
 
     def __init__(self, config):
         super().__init__()
@@ -234,9 +242,17 @@ class CameraHead(nn.Module):
     def forward(self, x):
         for unit in self.res_conv:
             x = unit(x)
-        x = self.more_mlps(x.mean(dim=1))
+        x = x.mean(dim=1)
+        for layer in self.more_mlps[0], self.more_mlps[2]:
+            x = F.leaky_relu(layer(x), self.slope)
         fov = self.fc_fov(x) if hasattr(self, "fc_fov") else None
         return self.fc_t(x), self.fc_rot(x), fov
+
+    def leak(self, slope):
+        """Sets the slope of all units on negative inputs."""
+        self.slope = slope
+        for unit in self.res_conv:
+            unit.slope = slope
 
 
 def nearest_rotation(nine):

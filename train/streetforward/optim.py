@@ -9,6 +9,10 @@ MUON = (".attn.qkv.weight", ".attn.proj.weight", ".mlp.fc1.weight", ".mlp.fc2.we
 # Output layers whose numbers are metres or log ratios: the factor on their step that an output scale would give.
 STEP_FACTOR = {"camera_head.fc_t.": 5.0, "camera_head.fc_fov.": 0.3}
 
+# Its gradient is cut by itself: calibrated units have large weights, and its norm (130 against 2 of all others) would decide
+# how much a batch counts for the trunk.
+APART = "camera_head."
+
 
 def orthogonal(g, steps=5):
     """Newton-Schulz iteration towards the nearest matrix with singular values near one; g [N, a, b], a <= b."""
@@ -43,12 +47,18 @@ class Optimizer:
         self.first, self.second = zeros(total - self.edge), zeros(total - self.edge)
         self.factor, self.decays = zeros(total - self.edge) + 1, zeros(total - self.edge)
         self.groups, at = [], 0  # runs of matrices of one shape: (offset, count, shape)
+        self.parts = [[], []]  # [from, to) of the parameters that are cut together: the trunk's, and those under APART
         for name, p in matrices + others:
             n, shape = p.numel(), p.shape
             self.weights[at : at + n] = p.detach().flatten()
             p.data = self.weights[at : at + n].view(shape)
             p.grad = self.grads[at : at + n].view(shape)
             p.requires_grad_(True)
+            spans = self.parts[name.startswith(APART)]
+            if spans and spans[-1][1] == at:
+                spans[-1][1] += n
+            else:
+                spans.append([at, at + n])
             if at < self.edge:
                 if self.groups and self.groups[-1][2] == shape:
                     self.groups[-1][1] += 1
@@ -68,19 +78,22 @@ class Optimizer:
 
     @torch.no_grad()
     def step(self, scale, rank=0, ranks=1, reduce=None):
-        """One update at `scale` times the learning rates; returns the gradient's norm.
+        """One update at `scale` times the learning rates; returns the gradient's norm without the camera head's.
 
         With ranks the gradients are averaged first, and each rank orthogonalises its share of the matrices.
         """
         if ranks > 1:
             reduce(self.grads)
             self.grads /= ranks
-        norm = self.grads.norm().item()
-        if not math.isfinite(norm):
+        norms = [math.hypot(*(self.grads[a:b].norm().item() for a, b in spans)) for spans in self.parts]
+        norm = norms[0]
+        if not math.isfinite(sum(norms)):
             self.grads.zero_()
-            return norm
-        if norm > self.clip:
-            self.grads.mul_(self.clip / norm)
+            return sum(norms)
+        for n, spans in zip(norms, self.parts):
+            if n > self.clip:
+                for a, b in spans:
+                    self.grads[a:b].mul_(self.clip / n)
         self.steps += 1
 
         self.momentum.mul_(0.95).add_(self.grads[: self.edge])

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 from . import config as cfg
-from . import ranks
+from . import probe, ranks
 from .batched import Wanted, forward_clips
 from .calibrate import calibrate_camera
 from .data import Chunks, Loader, Sampler, collate, held_out, read_clip
@@ -29,21 +29,24 @@ from .losses import (
     sky_loss,
 )
 from .optim import Optimizer
-from .weights import scratch_start, write_model
+from .weights import read_model, scratch_start, write_model
 
 KEEP_STILL = ("decoder.1", "decoder.3")  # global layers whose first head is taught to match
 KEEP_MOTION = ("causal.0",)
+TELL_STILL = ("decoder.3", "decoder.5")  # layers after which tokens are asked for displacements
+TELL_MOTION = ("causal.1",)
 
 WEIGHTS = {
     "depth": 1.0,
     "slope": 0.5,
     "sky": 0.2,
-    "rotation": 5.0,
+    "rotation": 10.0,
     "translation": 0.4,
     "focal": 2.0,
     "velocity": 0.2,  # per pass, summed over the three axes
     "dynamic": 0.25,  # per pass
-    "matching": 0.3,  # shared by the supervised heads
+    "matching": 0.6,  # shared by the supervised heads
+    "displacement": 1.5,  # shared by the probed layers
 }
 
 
@@ -51,6 +54,11 @@ def learning_rate(fraction, steps, warmup=60, floor=0.03):
     """Warm-up by steps, then a cosine over the budget down to `floor`."""
     cosine = floor + (1 - floor) * (1 + math.cos(math.pi * min(fraction, 1.0))) / 2
     return min(1.0, (steps + 1) / warmup) * cosine
+
+
+def leak(fraction, start=0.1, until=0.6):
+    """Slope of the camera head's units on negative inputs: falls to 0, the network's own ReLU, at `until`."""
+    return max(0.0, start * (1 - fraction / until))
 
 
 def choose(count, frames, first, last, per_clip, generator):
@@ -67,14 +75,16 @@ def step_losses(model, batch, fraction, args, generator):
     device = batch.images.device
     wanted = Wanted(depth=choose(count, frames, 0, frames - 1, args.depth_frames, generator).to(device))
     keep = KEEP_STILL if args.matching else ()
+    tell = TELL_STILL if hasattr(model, probe.NAME) else ()
     if moving:
         wanted.motion = {
             "fwd": choose(count, frames, 0, frames - 2, args.motion_frames, generator).to(device),
             "bwd": choose(count, frames, 1, frames - 1, args.motion_frames, generator).to(device),
         }
         keep += KEEP_MOTION if args.matching else ()
+        tell += TELL_MOTION if tell else ()
     with torch.autocast(device.type, torch.bfloat16, enabled=args.bf16):
-        raw = forward_clips(model, batch.images, batch.times, wanted, keep)
+        raw = forward_clips(model, batch.images, batch.times, wanted, keep, tell)
 
     depth = batch.depth.flatten(0, 1)
     truth = depth[wanted.depth]
@@ -94,18 +104,21 @@ def step_losses(model, batch, fraction, args, generator):
             target = velocity[rows] * (sign if way == "fwd" else -sign)
             value, mask = motion_losses(raw.motion[way], target, depth[rows], config)
             loss["velocity"], loss["dynamic"] = loss["velocity"] + value, loss["dynamic"] + mask
-    if raw.kept:
+    if raw.kept or raw.tokens:
         grid = height // config["patch"], width // config["patch"]
-        matching = matching_loss(raw.kept, patch_matches(batch, config["patch"]), grid)
+        matches = patch_matches(batch, config["patch"])
+        matching = matching_loss(raw.kept, matches, grid)
         loss |= {f"matching.{name}": value for name, value in matching.items()}
+        told = probe.displacement_loss(getattr(model, probe.NAME, None), raw.tokens, matches)
+        loss |= {f"displacement.{name}": value for name, value in told.items()}
 
     weighted = {}
     for name, value in loss.items():
         weight = WEIGHTS[name.split(".")[0]]
         if name == "dynamic" and fraction > 2 / 3:
             weight *= 2
-        if name.startswith("matching."):
-            weight /= len(KEEP_STILL) if "decoder" in name else 2
+        if name.startswith(("matching.", "displacement.")):
+            weight /= 2
         weighted[name] = weight * value
     return loss, weighted
 
@@ -117,13 +130,15 @@ class Run:
         self.args, self.reduce = args, reduce
         self.device = torch.device(args.device)
         width, height = (int(n) for n in args.size.split("x"))
-        config = cfg.preset(args.preset)
-        self.model = scratch_start(config, args.seed).to(self.device)
+        self.model = read_model(args.model) if args.model else scratch_start(cfg.preset(args.preset), args.seed)
+        config = self.model.to(self.device).config
         self.chunks = Chunks(args.generator, args.cache, "train", width, height)
         if args.calibrate and not (args.out / "resume.pt").exists():
             clips = [read_clip(self.chunks.clip(i, wait=args.rank > 0)) for i in range(args.calibrate)]
             batches = [collate(clips[i : i + 4]).to(self.device) for i in range(0, len(clips), 4)]
             note(args, event="calibrate", **calibrate_camera(self.model, batches))
+        if args.displacement:
+            self.model.add_module(probe.NAME, probe.Probe(TELL_STILL + TELL_MOTION, self.chunks.frames, config).to(self.device))
         self.optimizer = Optimizer(
             self.model,
             lambda name: not name.startswith("gs_"),
@@ -163,6 +178,7 @@ class Run:
             fraction = now / budget
             if fraction >= 1 or clock[1] or (args.steps and self.optimizer.steps >= args.steps):
                 break
+            self.model.camera_head.leak(leak(fraction, args.leak))
             batch = self.loader.next().to(self.device)
             generator = torch.Generator().manual_seed((args.seed << 40) + (self.samples << 3) + args.rank)
             loss, weighted = step_losses(self.model, batch, fraction, args, generator)
@@ -198,6 +214,7 @@ def parser():
     p.add_argument("--cache", type=Path, required=True, help="folder for generated clips")
     p.add_argument("--generator", type=Path, required=True, help="the clip generator's `stream` example")
     p.add_argument("--preset", default="nano")
+    p.add_argument("--model", type=Path, help="start from these weights instead of from scratch")
     p.add_argument("--size", default="168x112")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--minutes", type=float, default=100, help="training time of the whole schedule, resumptions added up")
@@ -217,6 +234,8 @@ def parser():
     p.add_argument("--depth-frames", type=int, default=2, help="frames of a clip whose depth is computed")
     p.add_argument("--motion-frames", type=int, default=2, help="frames of a clip and pass whose motion is computed")
     p.add_argument("--no-matching", dest="matching", action="store_false")
+    p.add_argument("--no-displacement", dest="displacement", action="store_false")
+    p.add_argument("--leak", type=float, default=0.1, help="slope of the camera head's units on negative inputs at the start")
     p.add_argument("--eval-clips", type=int, default=96)
     p.add_argument("--eval-minutes", type=float, default=10)
     p.add_argument("--save-minutes", type=float, default=3)

@@ -9,6 +9,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from . import config as cfg
+from . import probe
 from .model import StreetForward
 
 
@@ -183,7 +184,11 @@ def edge_bias(model, config):
 def write_model(path, model, dtype=None):
     """Writes a model with its configuration, whole or not at all; `dtype` f16 or bf16 stores it smaller."""
     path = Path(path)
-    tensors = {name: p.detach().to("cpu", dtype).contiguous().clone() for name, p in model.state_dict().items()}
+    tensors = {
+        name: p.detach().to("cpu", dtype).contiguous().clone()
+        for name, p in model.state_dict().items()
+        if not name.startswith(probe.NAME + ".")
+    }
     partial = path.with_name(path.name + ".partial")
     save_file(tensors, partial, {cfg.METADATA_KEY: cfg.to_json(model.config)})
     partial.replace(path)

@@ -10,7 +10,7 @@ import torch
 
 from stand_in import fake_records
 from streetforward import config as cfg
-from streetforward import train
+from streetforward import probe, train
 from streetforward.batched import Raw, Wanted, forward_clips
 from streetforward.calibrate import calibrate_camera
 from streetforward.compose import Scene, camera_at, far_shell, gaussians_at, pose_between, sources
@@ -128,10 +128,10 @@ def test_two_ranks_step_as_one():
     pair = [build()[1] for _ in range(2)]
     for _ in range(3):
         summed, updates = gradients.sum(0), []
-        probe = [build()[1] for _ in range(2)]
+        each = [build()[1] for _ in range(2)]
         for r in range(2):  # first what each rank adds to the exchanged update
-            probe[r].load(pair[r].state())
-            probe[r].grads.copy_(gradients[r])
+            each[r].load(pair[r].state())
+            each[r].grads.copy_(gradients[r])
 
             def collect(t, r=r):
                 if len(t) == len(summed):
@@ -139,7 +139,7 @@ def test_two_ranks_step_as_one():
                 else:
                     updates.append(t.clone())
 
-            probe[r].step(1.0, r, 2, collect)
+            each[r].step(1.0, r, 2, collect)
         for r in range(2):
             pair[r].grads.copy_(gradients[r])
             pair[r].step(1.0, r, 2, lambda t: t.copy_(summed if len(t) == len(summed) else sum(updates)))
@@ -228,7 +228,7 @@ def test_a_run_resumes_and_learns(tmp_path, generator):
     assert [entry["step"] for entry in steps] == [1, 2, 3, 4, 5]
     assert [entry["samples"] for entry in steps] == [2, 4, 6, 8, 10]
     assert steps[-1]["depth"] < steps[0]["depth"]
-    assert all(name in steps[0] for name in ("velocity", "dynamic", "rotation", "matching.causal.bwd.0", "matching.decoder.3"))
+    assert all(name in steps[0] for name in ("velocity", "dynamic", "rotation", "matching.causal.bwd.0", "matching.decoder.3", "displacement.decoder.5"))
     assert [entry["event"] for entry in log if "event" in entry] == ["calibrate", "eval", "resume", "eval"]
     model = read_model(tmp_path / "run" / "ema.safetensors")
     assert model.config == cfg.nano()
@@ -255,6 +255,65 @@ def test_calibrated_units_live():
     truth = torch.cat([b.pose[..., :3, 3] for b in batches]).flatten(0, 1)
     rest = torch.cat(errors).square().sum() / (truth - truth.mean(0)).square().sum()
     assert rest.item() == pytest.approx(1 - explained["fc_t"], abs=1e-3) and explained["fc_t"] > 0.5
+
+
+def test_displacement_is_what_the_probe_is_asked_for():
+    """A wall seen from 1.4 m aside moves by one patch: exact displacements cost nothing, none cost one patch, and the probe learns them."""
+    config = cfg.nano()
+    matches = patch_matches(wall(shift=(1.4, 0.0, 0.0)), 14)
+    told = probe.Probe(("decoder.5", "causal.1"), 2, config)
+    tokens = {"decoder.5": torch.zeros(1, 2, 24, 128), "causal.fwd.1": torch.zeros(1, 2, 24, cfg.causal_dim(config))}
+    none = probe.displacement_loss(told, tokens, matches)
+    assert all(loss.item() == pytest.approx(1 - 0.25, abs=1e-3) for loss in none.values())  # smooth L1 of one patch
+    with torch.no_grad():
+        told.linear["decoder_5"].bias.copy_(torch.tensor([0.0, 1.0, 0.0, -1.0]))  # (row, column) to frame 0, to frame 1
+        told.linear["causal_1"].bias.copy_(torch.tensor([0.0, -1.0]))
+    exact = probe.displacement_loss(told, tokens, matches)
+    assert all(loss.item() < 1e-6 for loss in exact.values())
+
+
+def test_the_probe_is_not_shipped(tmp_path):
+    model = scratch_start(cfg.nano(), 1)
+    names = set(model.state_dict())
+    model.add_module(probe.NAME, probe.Probe(train.TELL_STILL + train.TELL_MOTION, 4, model.config))
+    write_model(tmp_path / "model.safetensors", model)
+    assert set(read_model(tmp_path / "model.safetensors").state_dict()) == names
+
+
+def test_the_leak_ends():
+    """Off units pass a gradient while they leak, and the head is the network's own again when the schedule says so."""
+    assert train.leak(0.0) == 0.1 and train.leak(0.3) == pytest.approx(0.05) and train.leak(0.6) == train.leak(1.0) == 0
+    head = scratch_start(cfg.nano(), 1).camera_head
+    plain = head(torch.ones(1, 4, 128))
+    with torch.no_grad():
+        head.more_mlps[0].bias.fill_(-100.0)  # every unit behind the average is off
+    for slope, alive in ((0.0, False), (0.1, True)):
+        head.leak(slope)
+        x = torch.ones(1, 4, 128, requires_grad=True)
+        head(x)[0].sum().backward()
+        assert bool(x.grad.abs().sum() > 0) == alive
+    head.leak(0.0)
+    with torch.no_grad():
+        head.more_mlps[0].bias.zero_()
+    assert all(a.shape == b.shape for a, b in zip(plain, head(torch.ones(1, 4, 128))))
+
+
+def test_the_camera_head_is_cut_by_itself():
+    class Model(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.trunk, self.camera_head = torch.nn.Linear(3, 3), torch.nn.Linear(3, 3)
+
+    optimizer = Optimizer(Model(), lambda name: True, clip=2.0)
+    (a, b), = optimizer.parts[True]
+    optimizer.grads.fill_(0.1)
+    optimizer.grads[a:b] = 100.0
+    first = optimizer.first.clone()
+    norm = optimizer.step(1.0)
+    assert norm == pytest.approx(0.1 * 12**0.5)  # the trunk's gradient stays as it was
+    moved = (optimizer.first - first) * 10
+    assert moved[a:b].norm().item() == pytest.approx(2.0, rel=1e-4)
+    assert torch.allclose(torch.cat((moved[:a], moved[b:])), torch.tensor(0.1))
 
 
 def test_a_generator_that_fails_is_reported(tmp_path):
