@@ -83,7 +83,13 @@ fn draw(chart: &Chart, list: &[Series]) -> String {
         let all = || list.iter().flat_map(|s| &s.points).map(of);
         (all().fold(f64::MAX, f64::min) / 1.2, all().fold(0.0, f64::max) * 1.2)
     };
-    let (xs, ys) = (range(|p| p.x), range(|p| p.y));
+    let (xs, mut ys) = (range(|p| p.x), range(|p| p.y));
+    let in_proportion = chart.y.0.starts_with("ms");
+    // Where the line of time in proportion ends.
+    let end = |s: &Series| s.points[0].y * s.points[s.points.len() - 1].x / s.points[0].x;
+    if in_proportion {
+        ys.1 = list.iter().map(end).fold(ys.1, f64::max);
+    }
     let place = |v: f64, (low, high): (f64, f64)| (v / low).ln() / (high / low).ln();
     let (at_x, at_y) = (|v: f64| 60.0 + 860.0 * place(v, xs), |v: f64| 330.0 - 310.0 * place(v, ys));
     let mut svg = format!("<h3>{}</h3><svg viewBox=\"0 0 960 372\" role=\"img\">", escape(chart.title));
@@ -114,15 +120,14 @@ fn draw(chart: &Chart, list: &[Series]) -> String {
     for (i, s) in list.iter().enumerate() {
         let colour = COLOURS[i % COLOURS.len()];
         let (first, last) = (&s.points[0], &s.points[s.points.len() - 1]);
-        if chart.y.0.starts_with("ms") {
-            let end = first.y * last.x / first.x;
+        if in_proportion {
             let _ = write!(
                 svg,
                 "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"{colour}\" stroke-dasharray=\"4 4\" opacity=\".6\"/>",
                 at_x(first.x),
                 at_y(first.y),
                 at_x(last.x),
-                at_y(end)
+                at_y(end(s))
             );
         }
         for p in &s.points {

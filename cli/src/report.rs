@@ -285,8 +285,8 @@ fn bench(v: &Value) -> String {
     let name = |r: &Value| {
         let part = |key: &str, unit: &str| scalar(&r[key]).map(|s| format!("{s}{unit}"));
         let threads = part("threads", if r["threads"] == 1 { " thread" } else { " threads" });
-        let parts =
-            [part("preset", "").or(part("model", "")), part("precision", ""), threads, part("frames", " frames")];
+        let model = r["model"].as_str().map(|path| escape(path.rsplit('/').next().unwrap_or(path)));
+        let parts = [part("preset", "").or(model), part("precision", ""), threads, part("frames", " frames")];
         parts.into_iter().flatten().collect::<Vec<_>>().join(" ")
     };
     let bar =
@@ -319,22 +319,23 @@ fn peers(v: &Value) -> String {
     let row = |r: &&&Value| {
         let mut cells = vec![escape(&name(r))];
         let of = |v: &Value, unit: f64| v.as_f64().map_or("n/a".into(), |x| short(x / unit));
-        for key in ["median_ms", "round_low_ms", "round_high_ms", "times_ours", "cold_start_s"] {
-            cells.push(of(&r[key], 1.0));
-        }
+        cells.push(of(&r["median_ms"], 1.0));
+        cells.push(format!("{} to {}", of(&r["round_low_ms"], 1.0), of(&r["round_high_ms"], 1.0)));
+        let hundredths = |v: &Value| v.as_f64().map_or("n/a".into(), |x| format!("{x:.2}"));
+        cells.extend([&r["times_ours"], &r["cold_start_s"]].map(hundredths));
         cells.push(of(&r["peak_rss_bytes"], f64::from(1 << 20)));
         cells.extend(["depth_absrel", "rotation_deg", "velocity_epe"].map(|key| of(&r["error"][key], 1.0)));
         cells
     };
-    let heads = ["runtime", "ms", "lowest round", "highest", "x ours", "first result s", "peak MiB"];
-    let heads = [&heads[..], &["depth abs-rel", "rotation deg", "velocity units/s"]].concat();
+    let heads = ["runtime", "ms", "rounds", "x ours", "start s", "peak MiB", "depth", "degrees", "velocity"];
     let bar = |r: &&&Value| {
         let total = r["median_ms"].as_f64().unwrap_or(0.0);
         let (ours, other) = (("StreetForward".to_string(), total), ("others".to_string(), total));
         Bar { label: name(r), total, parts: vec![if r["runtime"] == "StreetForward" { ours } else { other }] }
     };
     let facts = format!(
-        "<p class=\"quiet\">{} frames of {}x{}, {} threads, {}; errors against f32</p>",
+        "<p class=\"quiet\">{} frames of {}x{}, {} threads, {}; start: process to first result; errors against f32: \
+         relative depth, rotation, velocity in units per second</p>",
         v["frames"],
         v["width"],
         v["height"],
