@@ -37,6 +37,9 @@ impl Rows {
     }
 }
 
+/// Who looks at the input rows of linear layers, by the number of the weight's tensor.
+pub(crate) type Seen<'a> = &'a dyn Fn(usize, &[f32]);
+
 /// Weights and the machine to run them on.
 #[derive(Clone, Copy)]
 pub(crate) struct Net<'a> {
@@ -44,7 +47,7 @@ pub(crate) struct Net<'a> {
     pub(crate) model: &'a Model,
     pub(crate) rows: &'a Rows,
     /// Who looks at the input rows of linear layers; the number is that of the weight's tensor.
-    pub(crate) seen: Option<&'a dyn Fn(usize, &[f32])>,
+    pub(crate) seen: Option<Seen<'a>>,
 }
 
 /// A convolution with its surroundings.

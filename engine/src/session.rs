@@ -8,7 +8,7 @@ use crate::dims::ClipShape;
 use crate::forward::{self, Areas, Forward, Memory};
 use crate::input::Input;
 use crate::model::Model;
-use crate::net::{Net, Rows};
+use crate::net::{Net, Rows, Seen};
 use crate::output::Output;
 use crate::plan::{DEFAULT_MAX_BYTES, Plan};
 use crate::probe::{Probe, STAGES, TapFn, Watch};
@@ -48,9 +48,6 @@ pub struct StageTime {
     /// Wall time.
     pub time: Duration,
 }
-
-/// Who looks at the input rows of linear layers, by the number of the weight's tensor.
-type Seen<'a> = &'a dyn Fn(usize, &[f32]);
 
 /// A model ready to run clips of one shape.
 pub struct Session {
@@ -230,15 +227,16 @@ impl Session {
         let _mode = DefaultFloatMode::enter();
         self.times = Default::default();
         self.layers.store(0, Ordering::Relaxed);
-        self.forward(input, None, (deadline, taps, seen))?;
+        self.forward(input, (None, seen), deadline, taps)?;
         Ok(&self.memory.output)
     }
 
     fn forward(
         &mut self,
         input: &Input,
-        encoded: Option<&[f32]>,
-        (deadline, taps, seen): (Option<Instant>, Option<TapFn>, Option<Seen>),
+        (encoded, seen): (Option<&[f32]>, Option<Seen>),
+        deadline: Option<Instant>,
+        taps: Option<TapFn>,
     ) -> Result<()> {
         let [pairs, guide, motion, work] = carve(self.arena.all(), self.plan.areas);
         let net =
@@ -285,7 +283,7 @@ impl Session {
                 return Ok(false);
             }
             let input = Input { shape, images: &window.images, times: &window.times, k };
-            self.forward(&input, Some(&window.tokens), (None, None, None)).map(|()| true)
+            self.forward(&input, (Some(&window.tokens), None), None, None).map(|()| true)
         });
         self.window = Some(window);
         Ok(result?.then_some(&self.memory.output))
