@@ -50,3 +50,31 @@ fn a_command_without_a_model_runs_the_shipped_one() {
     assert!(json["context_depth_absrel_scaled"].as_f64().unwrap() < 0.4, "{}", json["context_depth_absrel_scaled"]);
     assert!(json["translation_error_ratio"].as_f64().unwrap() < 0.6, "{}", json["translation_error_ratio"]);
 }
+
+/// int8 keeps what it promises on a street that no training saw, but for the whole render (docs/quantization.md).
+/// Calibration brings depth and poses nearer.
+#[test]
+fn int8_keeps_its_gates() {
+    let Some((checkpoint, _)) = shipped("int8_keeps_its_gates") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name).to_str().unwrap().to_string();
+    for seed in ["101", "102"] {
+        ok(&["synth", "--seed", seed, "--frames", "11", "--size", "168x112", "-o", &at(seed)]);
+    }
+    let (f32, plain, calibrated) = (at("f32.sfw"), at("plain.sfw"), at("calibrated.sfw"));
+    ok(&["convert", s(&checkpoint), "-o", &f32]);
+    ok(&["convert", s(&checkpoint), "-o", &plain, "--to", "int8"]);
+    let calib = at("102");
+    ok(&["convert", s(&checkpoint), "-o", &calibrated, "--to", "int8", "--calib", &calib, "--frames", "0,5,10"]);
+    let gates = "depth_absrel=0.01,rotation_deg_median=0.06,translation_deg_median=0.3,velocity_gate=1,\
+        dynamic_flip_fraction=0.003,render_psnr_dynamic=42,truth_psnr_fall=0.1,truth_psnr_dynamic_fall=0.15";
+    let clip = at("101");
+    let judge = |model: &str| {
+        ok_json(&["compare", &f32, model, "-i", &clip, "--frames", "0,5,10", "--outputs-only", "--gate", gates])
+    };
+    let (plain, calibrated) = (judge(&plain), judge(&calibrated));
+    for key in ["rotation_deg_median", "depth_absrel"] {
+        let [plain, calibrated] = [&plain, &calibrated].map(|j| j["outputs"][key].as_f64().unwrap());
+        assert!(calibrated > 0.0 && calibrated < plain, "{key}: {calibrated} calibrated, {plain} plain");
+    }
+}
