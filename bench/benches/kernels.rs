@@ -10,14 +10,6 @@ use sf_ops::{Ctx, Kernels, par::Pool, peak};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Peak of the threads running the probe at once, operations a second.
-fn peak_of(threads: usize, probe: impl Fn() -> f64 + Sync) -> f64 {
-    std::thread::scope(|s| {
-        let others: Vec<_> = (1..threads).map(|_| s.spawn(&probe)).collect();
-        probe() + others.into_iter().map(|t| t.join().expect("a probe does not panic")).sum::<f64>()
-    })
-}
-
 /// The median, in seconds, that criterion left for a bench; none when it was filtered out.
 fn median(root: &Path, group: &str, id: &str) -> Option<f64> {
     // Criterion replaces what file names cannot hold.
@@ -59,8 +51,8 @@ fn main() {
             let group = format!("{} ({})", layer.kind, kernels.isa.name());
             let time = Duration::from_millis(20);
             let probe = || match layer.peak {
-                Peak::F32 => peak_of(threads, || peak::flops_per_second(kernels, time)),
-                Peak::S8 => peak_of(threads, || peak::s8_ops_per_second(kernels, time)),
+                Peak::F32 => peak::together(threads, || peak::flops_per_second(kernels, time)),
+                Peak::S8 => peak::together(threads, || peak::s8_ops_per_second(kernels, time)),
                 Peak::Memory => 0.0,
             };
             let before = probe();
@@ -73,8 +65,8 @@ fn main() {
             g.bench_function(&layer.size, |b| b.iter(|| (layer.run)(ctx)));
             g.finish();
             let peak = before.max(match layer.peak {
-                Peak::F32 => peak_of(threads, || peak::flops_per_second(kernels, time)),
-                Peak::S8 => peak_of(threads, || peak::s8_ops_per_second(kernels, time)),
+                Peak::F32 => peak::together(threads, || peak::flops_per_second(kernels, time)),
+                Peak::S8 => peak::together(threads, || peak::s8_ops_per_second(kernels, time)),
                 Peak::Memory => 0.0,
             });
             let kernel = match layer.peak {

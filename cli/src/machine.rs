@@ -132,13 +132,10 @@ pub(crate) struct Peak {
 impl Peak {
     /// Measures for `time` each, on all threads at once: cores share clock and power.
     pub(crate) fn measure(kernels: &Kernels, threads: usize, time: Duration) -> Peak {
-        let together = |probe: fn(&Kernels, Duration) -> f64| -> f64 {
-            std::thread::scope(|scope| {
-                let probes: Vec<_> = (0..threads).map(|_| scope.spawn(move || probe(kernels, time))).collect();
-                probes.into_iter().map(|p| p.join().unwrap_or(0.0)).sum()
-            })
-        };
-        Peak { f32: together(peak::flops_per_second), s8: together(peak::s8_ops_per_second) }
+        Peak {
+            f32: peak::together(threads, || peak::flops_per_second(kernels, time)),
+            s8: peak::together(threads, || peak::s8_ops_per_second(kernels, time)),
+        }
     }
 }
 

@@ -80,15 +80,6 @@ impl Case {
     }
 }
 
-/// Peak of `threads` threads at once.
-fn peak_of(threads: usize, probe: fn(&Kernels, Duration) -> f64) -> f64 {
-    let probe = || probe(Kernels::best(), Duration::from_millis(40));
-    std::thread::scope(|s| {
-        let others: Vec<_> = (1..threads).map(|_| s.spawn(probe)).collect();
-        probe() + others.into_iter().map(|t| t.join().expect("a probe does not panic")).sum::<f64>()
-    })
-}
-
 /// int8 within 30 dB of f32, or the figures below mean nothing.
 fn check(shape: (usize, usize, usize, usize), mask: (i32, i32)) {
     let pool = Pool::new(2).expect("two threads");
@@ -109,6 +100,9 @@ fn shape(text: &str) -> (usize, usize, usize, usize) {
     let n: Vec<usize> = text.split('x').map(|v| v.parse().expect("four numbers joined by x")).collect();
     (n[0], n[1], n[2], n[3])
 }
+
+/// Time of a peak probe.
+const PROBE: Duration = Duration::from_millis(40);
 
 fn main() {
     let word = |i| std::env::args().nth(i);
@@ -140,8 +134,8 @@ fn main() {
         let mut best = vec![f64::INFINITY; cases.len()];
         for _ in 0..rounds {
             if rounds > 1 {
-                peaks[0] = peaks[0].max(peak_of(threads, peak::flops_per_second));
-                peaks[1] = peaks[1].max(peak_of(threads, peak::s8_ops_per_second));
+                peaks[0] = peaks[0].max(peak::together(threads, || peak::flops_per_second(Kernels::best(), PROBE)));
+                peaks[1] = peaks[1].max(peak::together(threads, || peak::s8_ops_per_second(Kernels::best(), PROBE)));
             }
             for ((_, case), best) in cases.iter_mut().zip(&mut best) {
                 *best = best.min(case.time(ctx));

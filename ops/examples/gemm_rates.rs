@@ -116,14 +116,8 @@ impl Case {
     }
 }
 
-/// Peak of `threads` threads at once.
-fn peak_of(threads: usize) -> f64 {
-    let probe = || peak::s8_ops_per_second(Kernels::best(), Duration::from_millis(40));
-    std::thread::scope(|s| {
-        let others: Vec<_> = (1..threads).map(|_| s.spawn(probe)).collect();
-        probe() + others.into_iter().map(|t| t.join().expect("a probe does not panic")).sum::<f64>()
-    })
-}
+/// Time of a peak probe.
+const PROBE: Duration = Duration::from_millis(40);
 
 fn main() {
     let number = |i| std::env::args().nth(i).and_then(|v| v.parse::<usize>().ok());
@@ -140,7 +134,7 @@ fn main() {
         let mut peak = 0.0f64;
         let mut times = vec![[Vec::new(), Vec::new()]; cases.len()];
         for _ in 0..rounds {
-            peak = peak.max(peak_of(threads));
+            peak = peak.max(peak::together(threads, || peak::s8_ops_per_second(Kernels::best(), PROBE)));
             for (case, times) in cases.iter_mut().zip(&mut times) {
                 for (times, act) in times.iter_mut().zip([Act::None, Act::Gelu]) {
                     times.push(case.time(&pool, act));

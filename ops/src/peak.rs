@@ -75,6 +75,15 @@ pub fn s8_ops_per_second(kernels: &Kernels, time: Duration) -> f64 {
     best
 }
 
+/// Sum of what `probe` ([`flops_per_second`] or [`s8_ops_per_second`]) gives on `threads` threads at once, operations per second: cores
+/// share clock and power.
+pub fn together(threads: usize, probe: impl Fn() -> f64 + Sync) -> f64 {
+    std::thread::scope(|s| {
+        let others: Vec<_> = (1..threads).map(|_| s.spawn(&probe)).collect();
+        probe() + others.into_iter().map(|t| t.join().unwrap_or(0.0)).sum::<f64>()
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -88,6 +97,13 @@ mod tests {
             let peak = s8_ops_per_second(k, Duration::from_millis(1));
             println!("{}: {:.1} GOP/s", k.product_s8.name, peak * 1e-9);
             assert!(peak > 1e6 && peak < 1e13, "{peak} operations per second");
+        }
+    }
+
+    #[test]
+    fn threads_add_up() {
+        for threads in [1, 2, 5] {
+            assert_eq!(together(threads, || 2.5), 2.5 * threads as f64);
         }
     }
 }
