@@ -299,7 +299,8 @@ fn a_plan_adds_up() {
         assert!(!json[key].is_null(), "{key}");
     }
     assert_eq!((&json["fits_max_mem"], &json["fits_memory"]), (&json!(true), &json!(true)));
-    let network = n("weights_bytes") + n("arena_bytes") + n("output_bytes") + n("input_bytes") + n("process_bytes");
+    let parts = ["weights", "arena", "threads", "tables", "output", "input", "process"];
+    let network: f64 = parts.iter().map(|part| n(&format!("{part}_bytes"))).sum();
     assert_eq!(n("network_peak_bytes"), network);
     assert_eq!(n("peak_bytes"), network + n("scene_bytes"));
     let pixels = 3.0 * 56.0 * 42.0;
@@ -366,6 +367,7 @@ fn pushes_are_timed_beside_the_whole_window() {
     let row = &json["results"][0];
     assert_eq!(row["push_runs"], 4);
     assert!(number(&row["push_p50_ms"]) > 0.0 && number(&row["push_whole_p50_ms"]) > 0.0);
+    assert!(number(&row["push_newest_p50_ms"]) > 0.0);
     assert!(ok_json(&args)["results"][0].get("push_runs").is_none());
     assert!(ok(&[&args[..], &["--push"]].concat()).contains("one new frame a step"));
     fails(2, &[&args[..], &["--push", "--period-ms", "10"]].concat());

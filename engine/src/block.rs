@@ -15,6 +15,7 @@ use sf_ops::attention::{self, FrameMask, Heads};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Mat, MatMut};
 use sf_ops::rope::{QkNorm, RopeTable, qk_norm_rope};
+use std::ops::Range;
 
 /// Sizes that decide the working memory of a block.
 #[derive(Clone, Copy, Debug)]
@@ -70,24 +71,35 @@ pub(crate) struct Sight<'a> {
 
 /// One block in place on x.
 pub(crate) fn forward(net: Net, block: &Block, x: &mut [f32], sight: Sight, scratch: &mut [f32]) {
+    let rows = sight.mask.frames * sight.mask.tokens;
+    forward_part(net, block, (None, x), sight, 0..rows, scratch);
+}
+
+/// [`forward`] for the rows `keep` alone, which have its bits; the others stay as they were. A q|k|v of all rows may have
+/// been computed before: two passes over the same input share it.
+pub(crate) fn forward_part(
+    net: Net,
+    block: &Block,
+    (shared, x): (Option<&[f32]>, &mut [f32]),
+    sight: Sight,
+    keep: Range<usize>,
+    scratch: &mut [f32],
+) {
     let (rows, dim) = (sight.mask.frames * sight.mask.tokens, block.dim);
     let shape = BlockShape::of(block, net.ctx.pool.threads());
     let [normed, wide, heads] = carve(scratch, shape.lens(&sight.mask));
     {
-        let [qkv, mixed] = carve(wide, shape.attention_lens(rows));
-        project(net, block, Mat::new(x, rows, dim), sight.rope, normed, qkv);
-        attend(net, block, qkv, sight, Attend { x, mixed, heads });
+        let [own, mixed] = carve(wide, shape.attention_lens(rows));
+        let qkv = match shared {
+            Some(qkv) => qkv,
+            None => {
+                project(net, block, Mat::new(x, rows, dim), sight.rope, normed, own);
+                own
+            }
+        };
+        attend(net, block, qkv, sight, Attend { x, mixed, heads, keep: keep.clone() });
     }
-    mlp(net, block, x, rows, normed, wide);
-}
-
-/// [`forward`] from a q|k|v that was computed before: two passes over the same input share it.
-pub(crate) fn forward_from(net: Net, block: &Block, qkv: &[f32], x: &mut [f32], sight: Sight, scratch: &mut [f32]) {
-    let rows = sight.mask.frames * sight.mask.tokens;
-    let shape = BlockShape::of(block, net.ctx.pool.threads());
-    let [normed, wide, heads] = carve(scratch, shape.lens(&sight.mask));
-    attend(net, block, qkv, sight, Attend { x, mixed: &mut wide[..rows * block.dim], heads });
-    mlp(net, block, x, rows, normed, wide);
+    mlp(net, block, &mut x[keep.start * dim..keep.end * dim], keep.len(), normed, wide);
 }
 
 /// q|k|v of x, `[rows, 3 dim]`, normed and with positions unless attention is int8, which does that itself. `normed` is working memory as large as x, or none for an int8 layer.
@@ -114,6 +126,8 @@ struct Attend<'a> {
     x: &'a mut [f32],
     mixed: &'a mut [f32],
     heads: &'a mut [f32],
+    /// Rows of x that are wanted.
+    keep: Range<usize>,
 }
 
 /// x += ls1 * proj(attention(qkv)).
@@ -128,7 +142,9 @@ fn attend(net: Net, block: &Block, qkv: &[f32], sight: Sight, to: Attend) {
     } else {
         attention::attention(net.ctx, qkv, block.heads, mask, to.heads, mixed);
     }
-    net.linear_onto(&block.proj, Act::None, block.ls1, Mat::new(to.mixed, rows, dim), MatMut::new(to.x, rows, dim));
+    let (values, n) = (to.keep.start * dim..to.keep.end * dim, to.keep.len());
+    let (mixed, x) = (&to.mixed[values.clone()], &mut to.x[values]);
+    net.linear_onto(&block.proj, Act::None, block.ls1, Mat::new(mixed, n, dim), MatMut::new(x, n, dim));
 }
 
 /// x += ls2 * fc2(gelu(fc1(norm2 x))).

@@ -58,6 +58,41 @@ fn lens(model: &Model, d: &Dims, threads: usize) -> [usize; 5] {
     [values, values, shared, taps(model).len() * values, scratch]
 }
 
+/// Frames that layer `layer` of `layers` reads and frames whose output it must give, for a pass of this reach whose last
+/// output is wanted for the frames `read`: its own and those that its later layers see.
+pub(crate) fn span(
+    reach: Reach,
+    read: &Range<usize>,
+    frames: usize,
+    (layer, layers): (usize, usize),
+) -> [Range<usize>; 2] {
+    let widened = |times: usize| {
+        let by = |step: i32| times as i64 * i64::from(step);
+        let first = (read.start as i64 + by(reach.lo.min(0))).max(0);
+        let end = (read.end as i64 + by(reach.hi.max(0))).min(frames as i64);
+        if read.is_empty() { read.clone() } else { first as usize..end as usize }
+    };
+    [widened(layers - layer), widened(layers - layer - 1)]
+}
+
+/// Frames of `due` whose map a pass of this direction must give, as one run: the others mirror the other direction.
+pub(crate) fn read(config: &ModelConfig, direction: Reach, due: &Range<usize>, frames: usize) -> Range<usize> {
+    let read = |&f: &usize| is_read(config, direction, f, frames);
+    match due.clone().find(read) {
+        Some(first) => first..due.clone().rfind(read).map_or(first, |last| last + 1),
+        None => due.start..due.start,
+    }
+}
+
+/// The smallest range that holds both.
+pub(crate) fn hull(a: Range<usize>, b: Range<usize>) -> Range<usize> {
+    match (a.is_empty(), b.is_empty()) {
+        (true, _) => b,
+        (_, true) => a,
+        _ => a.start.min(b.start)..a.end.max(b.end),
+    }
+}
+
 /// Values of working memory of [`run`].
 pub(crate) fn scratch_len(model: &Model, d: &Dims, threads: usize) -> usize {
     carved_len(lens(model, d, threads))
@@ -76,7 +111,9 @@ pub(crate) struct Job<'a> {
     pub(crate) times: &'a [f64],
     /// The image stem, for a guided motion head.
     pub(crate) guide: &'a [f32],
-    /// Raw motion maps, `[passes, frames, height, width, out]`.
+    /// Frames whose motion is wanted.
+    pub(crate) due: Range<usize>,
+    /// Raw motion maps, `[passes, frames, height, width, out]`; those that nobody reads are left alone.
     pub(crate) raw: &'a mut [f32],
     pub(crate) scratch: &'a mut [f32],
 }
@@ -86,24 +123,44 @@ pub(crate) fn run(net: Net, (d, tables): (&Dims, &Tables), job: Job, probe: &mut
     let (model, w) = (net.model, net.model.weights());
     let config = model.config();
     let (dim, per_frame) = (config.causal_dim() as usize, tokens(config, d));
-    let rows = d.frames * per_frame;
     let [start, x, shared, tapped, scratch] = carve(job.scratch, lens(model, d, net.ctx.pool.threads()));
     gather(config, d, (job.last, job.times), start);
     let rope = tables.rope(dim / w.causal[0].heads, causal_tokens(config));
-    if w.causal_back.is_none() {
-        block::project(net, &w.causal[0], Mat::new(start, rows, dim), Some(rope), &mut scratch[..rows * dim], shared);
-    }
-
     let (fwd, bwd) = Reach::of(config);
     let (ahead, behind) = Reach::directions(config);
     let back = w.causal_back.as_ref().unwrap_or(&w.causal);
-    let passes = [("fwd", Some((fwd, ahead)), &w.causal), ("bwd", bwd.zip(behind), back)];
+    // A tap wants to see maps that nobody reads, too.
+    let wanted = |direction| match probe.tapped() {
+        true => 0..d.frames,
+        false => read(config, direction, &job.due, d.frames),
+    };
+    let passes = [
+        ("fwd", Some((fwd, wanted(ahead))), &w.causal),
+        ("bwd", bwd.zip(behind).map(|(reach, direction)| (reach, wanted(direction))), back),
+    ];
+    // The frames whose q|k|v of layer 0 a pass reads.
+    let first = |pass: &Option<(Reach, Range<usize>)>| match pass {
+        Some((reach, read)) => span(*reach, read, d.frames, (0, w.causal.len()))[0].clone(),
+        None => 0..0,
+    };
+    if w.causal_back.is_none() {
+        let frames = hull(first(&passes[0].1), first(&passes[1].1));
+        let (from, n) = (frames.start * per_frame, frames.len() * per_frame);
+        let x = Mat::new(&start[from * dim..][..n * dim], n, dim);
+        let qkv = &mut shared[3 * from * dim..][..3 * n * dim];
+        block::project(net, &w.causal[0], x, Some(rope), &mut scratch[..n * dim], qkv);
+    }
+
     let map_len = d.frames * d.pixels() * config.motion.out as usize;
-    for ((name, reach, blocks), raw) in passes.into_iter().zip(job.raw.chunks_exact_mut(map_len)) {
-        let Some((reach, direction)) = reach else { continue };
-        x.copy_from_slice(start);
-        let mask = mask(config, d, reach);
-        let pass = Pass { net, d, tables, guide: job.guide, mask, blocks, direction, name };
+    for ((name, pass, blocks), raw) in passes.into_iter().zip(job.raw.chunks_exact_mut(map_len)) {
+        let Some((reach, read)) = pass else { continue };
+        if read.is_empty() {
+            continue;
+        }
+        let seen = span(reach, &read, d.frames, (0, blocks.len()))[0].clone();
+        let values = seen.start * per_frame * dim..seen.end * per_frame * dim;
+        x[values.clone()].copy_from_slice(&start[values]);
+        let pass = Pass { net, d, tables, guide: job.guide, reach, read, blocks, name };
         let shared = w.causal_back.is_none().then_some(&*shared);
         pass.layers(shared, x, tapped, scratch, probe)?;
         probe.lap("causal");
@@ -151,14 +208,16 @@ struct Pass<'a> {
     d: &'a Dims,
     tables: &'a Tables,
     guide: &'a [f32],
-    mask: FrameMask,
+    reach: Reach,
+    /// Frames whose map is read.
+    read: Range<usize>,
     blocks: &'a [Block],
-    direction: Reach,
     name: &'static str,
 }
 
 impl Pass<'_> {
-    /// All causal layers in place on `x`; layer 0 from `shared` q|k|v where both passes have it.
+    /// All causal layers in place on `x`; layer 0 from `shared` q|k|v where both passes have it. A layer runs on the frames that
+    /// the wanted ones still depend on.
     fn layers(
         &self,
         shared: Option<&[f32]>,
@@ -167,21 +226,24 @@ impl Pass<'_> {
         scratch: &mut [f32],
         probe: &mut Probe,
     ) -> Result<()> {
-        let kept = taps(self.net.model);
-        let dim = self.blocks[0].dim;
+        let (kept, config) = (taps(self.net.model), self.net.model.config());
+        let (dim, per_frame) = (self.blocks[0].dim, tokens(config, self.d));
+        let row = per_frame * dim;
         for (i, block) in self.blocks.iter().enumerate() {
-            let rope = self.tables.rope(dim / block.heads, causal_tokens(self.net.model.config()));
-            let sight = Sight { mask: self.mask, rope: Some(rope) };
-            match (i, shared) {
-                (0, Some(qkv)) => block::forward_from(self.net, block, qkv, x, sight, scratch),
-                _ => block::forward(self.net, block, x, sight, scratch),
-            }
-            probe.layer(format_args!("causal.{}.{i}", self.name), x)?;
+            let rope = self.tables.rope(dim / block.heads, causal_tokens(config));
+            let [seen, out] = span(self.reach, &self.read, self.d.frames, (i, self.blocks.len()));
+            let mask = FrameMask { frames: seen.len(), ..mask(config, self.d, self.reach) };
+            let qkv = if i == 0 { shared.map(|s| &s[3 * seen.start * row..3 * seen.end * row]) } else { None };
+            let keep = (out.start - seen.start) * per_frame..(out.end - seen.start) * per_frame;
+            let part = (qkv, &mut x[seen.start * row..seen.end * row]);
+            block::forward_part(self.net, block, part, Sight { mask, rope: Some(rope) }, keep, scratch);
+            let values = out.start * row..out.end * row;
+            probe.layer(format_args!("causal.{}.{i}", self.name), &x[values.clone()])?;
             if let Some(slot) = kept.iter().position(|&t| t == i) {
-                tapped[slot * x.len()..][..x.len()].copy_from_slice(x);
+                tapped[slot * x.len()..][values.clone()].copy_from_slice(&x[values]);
             }
             if probe.tapped() {
-                let features = Features::dense(x, dim, self.d, self.mask.tokens);
+                let features = Features::dense(x, dim, self.d, per_frame);
                 for f in 0..self.d.frames {
                     let patches = &features.patches(f).data[..self.d.patches * dim];
                     probe.emit(format_args!("causal.{}.{i}", self.name), Some(f), &[self.d.patches, dim], patches);
@@ -191,19 +253,11 @@ impl Pass<'_> {
         Ok(())
     }
 
-    /// Frames whose map is read: the others mirror the other direction, and only a tap wants to see them.
-    fn read(&self, tapped: bool) -> Range<usize> {
-        let (config, n) = (self.net.model.config(), self.d.frames);
-        let read = |f: usize| tapped || is_read(config, self.direction, f, n);
-        let first = (0..n).find(|&f| read(f)).unwrap_or(n);
-        first..(first..n).rfind(|&f| read(f)).map_or(first, |last| last + 1)
-    }
-
     /// The motion head on this pass's tokens or taps. It looks at one frame at a time, so that frames nobody reads
     /// are left out from its decoder on.
     fn motion(&self, x: &[f32], tapped: &[f32], scratch: &mut [f32], raw: &mut [f32], probe: &mut Probe) -> Result<()> {
         let dim = self.blocks[0].dim;
-        let frames = self.read(probe.tapped());
+        let frames = self.read.clone();
         let d = &Dims { frames: frames.len(), ..*self.d };
         let head = self.net.model.weights().motion.as_ref().expect("a causal module has a motion head");
         let dense = Dense {
@@ -216,8 +270,8 @@ impl Pass<'_> {
             tokens: Tokens::Patches,
             name: "motion",
         };
-        let row = self.mask.tokens * dim;
-        let (read, tokens) = (frames.start * row..frames.end * row, self.mask.tokens);
+        let tokens = tokens(self.net.model.config(), self.d);
+        let read = frames.start * tokens * dim..frames.end * tokens * dim;
         let source = match head {
             DenseHead::Linear(_) | DenseHead::Guided(_) => Source::Tokens(Features::dense(&x[read], dim, d, tokens)),
             DenseHead::Dpt(dpt) => {
@@ -232,7 +286,7 @@ impl Pass<'_> {
         let (out, first) = (heads::channels(head), frames.start);
         let maps = raw.chunks_exact_mut(d.pixels() * out).skip(first).take(frames.len());
         for (f, map) in maps.enumerate() {
-            dense.frame(source, f, scratch, map);
+            dense.frame(source, f, (&mut *scratch, map), probe)?;
             probe.guard(format_args!("motion.{}", self.name), map)?;
             probe.emit(format_args!("motion.{}", self.name), Some(first + f), &[d.height, d.width, out], map);
         }

@@ -2,7 +2,8 @@
 //!
 //! Every weight matrix `[n, k]` meets a number of rows that its name tells: tokens of all frames, patches, pixels of
 //! a pyramid's level. Attention adds two products over the keys that each query sees. What is counted is what a
-//! run executes: a q|k|v that both causal passes share counts once, and motion maps that nobody reads do not count.
+//! run executes: a q|k|v that both causal passes share counts once, and motion maps that nobody reads do not count, nor do the
+//! rows of causal layers that only they would depend on.
 //! Norms, activations, resizes and other work per value are not in it.
 
 use crate::aggregator::is_global;
@@ -17,6 +18,7 @@ use sf_formats::arch::{self, Role};
 use sf_formats::blob::Dtype;
 use sf_formats::config::ModelConfig;
 use sf_ops::attention::FrameMask;
+use std::ops::Range;
 
 /// Multiply-adds of one stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -143,10 +145,31 @@ fn read_frames(c: &ModelConfig, d: &Dims) -> Vec<usize> {
     directions.map(read).collect()
 }
 
+/// A pass over time: its reach, and the frames whose motion map is read.
+type Pass = (Reach, Range<usize>);
+
+/// The passes that run with the weights of `part`.
+fn passes_of(c: &ModelConfig, d: &Dims, part: &str) -> Vec<Pass> {
+    let (ahead, behind) = Reach::directions(c);
+    let directions = [Some(ahead), behind].into_iter().flatten();
+    let read = directions.map(|direction| causal::read(c, direction, &(0..d.frames), d.frames));
+    let passes: Vec<Pass> = passes(c, d).into_iter().zip(read).collect();
+    let second = passes.len().min(1);
+    match (part, c.causal_share) {
+        ("causal", true) => passes,
+        ("causal", false) => passes[..second].to_vec(),
+        _ => passes[second..].to_vec(),
+    }
+}
+
+/// Frames that causal layer `i` reads, and frames that it gives.
+fn causal_span(c: &ModelConfig, d: &Dims, (reach, read): &Pass, i: usize) -> [Range<usize>; 2] {
+    causal::span(*reach, read, d.frames, (i, c.causal_depth as usize))
+}
+
 /// What the queries of a block see, once for every time that it runs; `name` is a tensor of the block.
 fn masks(c: &ModelConfig, d: &Dims, name: &str) -> Vec<FrameMask> {
     let part = name.split('.').next().unwrap_or_default();
-    let passes = passes(c, d);
     match part {
         "encoder" => vec![d.frame_mask(d.encoder_tokens)],
         "decoder" if is_global(c, layer(name)) => vec![d.global_mask()],
@@ -155,18 +178,17 @@ fn masks(c: &ModelConfig, d: &Dims, name: &str) -> Vec<FrameMask> {
             read_frames(c, d).into_iter().map(read).collect()
         }
         "causal" | "causal_back" => {
-            let run = match (part, c.causal_share) {
-                ("causal", true) => &passes[..],
-                ("causal", false) => &passes[..passes.len().min(1)],
-                _ => &passes[passes.len().min(1)..],
+            let mask = |pass: &Pass| {
+                let [seen, _] = causal_span(c, d, pass, layer(name));
+                FrameMask { frames: seen.len(), ..causal::mask(c, d, pass.0) }
             };
-            run.iter().map(|&reach| causal::mask(c, d, reach)).collect()
+            passes_of(c, d, part).iter().map(mask).collect()
         }
         _ => vec![d.frame_mask(d.tokens)],
     }
 }
 
-/// Number of an aggregator layer, `decoder.{i}`.
+/// Number of an aggregator or causal layer, `decoder.{i}`.
 fn layer(name: &str) -> usize {
     name.split('.').nth(1).and_then(|i| i.parse().ok()).expect("a layer's number")
 }
@@ -175,7 +197,6 @@ fn layer(name: &str) -> usize {
 fn rows(c: &ModelConfig, d: &Dims, name: &str) -> (&'static str, usize) {
     let f = d.frames;
     let (part, rest) = name.split_once('.').unwrap_or((name, ""));
-    let passes = passes(c, d);
     match part {
         "encoder" if rest.starts_with("patch_embed") => ("preprocess", f * d.patches),
         "image_stem" => ("preprocess", f * d.pixels() / 4),
@@ -186,14 +207,16 @@ fn rows(c: &ModelConfig, d: &Dims, name: &str) -> (&'static str, usize) {
         "camera_head" if rest.starts_with("res_conv") => ("camera", f * d.patches),
         "camera_head" => ("camera", f),
         "causal" | "causal_back" => {
-            let once = !passes.is_empty() && rest.starts_with("0.attn.qkv");
-            let runs = match (part, c.causal_share) {
-                ("causal", true) if once => 1,
-                ("causal", true) => passes.len(),
-                ("causal", false) => passes.len().min(1),
-                _ => passes.len().saturating_sub(1),
+            let spans =
+                passes_of(c, d, part).iter().map(|pass| causal_span(c, d, pass, layer(name))).collect::<Vec<_>>();
+            let frames = match rest.contains(".attn.qkv") {
+                true if part == "causal" && c.causal_share && rest.starts_with("0.") => {
+                    spans.into_iter().map(|[seen, _]| seen).fold(0..0, causal::hull).len()
+                }
+                true => spans.iter().map(|[seen, _]| seen.len()).sum(),
+                false => spans.iter().map(|[_, out]| out.len()).sum(),
             };
-            ("causal", runs * f * causal::tokens(c, d))
+            ("causal", frames * causal::tokens(c, d))
         }
         "motion_decoder" => ("motion", read_frames(c, d).iter().sum::<usize>() * d.patches),
         "motion_head" => ("motion", read_frames(c, d).iter().sum::<usize>() * head_rows(d, rest)),
@@ -241,7 +264,8 @@ mod tests {
             2e-9 * cost.stages.iter().filter(|s| names.contains(&s.name)).map(StageCost::macs).sum::<u64>() as f64
         };
         let (p, dim) = ((height / 14 * (width / 14)) as f64, f64::from(config.causal_dim()));
-        let shared = 2e-9 * 4.0 * p * 3.0 * dim * dim;
+        // One q|k|v; and of one frame in each of two passes, the last layer behind its attention.
+        let shared = 2e-9 * p * (4.0 * 3.0 + 2.0 * 9.0) * dim * dim;
         let unread = match config.motion.kind {
             HeadKind::XdecLinear => {
                 // Of one frame in each of two passes: the last layer, both projections, and the decoder's blocks.

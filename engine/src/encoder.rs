@@ -40,7 +40,7 @@ pub(crate) fn run(net: Net, d: &Dims, tables: &Tables, images: &[u8], to: Encode
     let (first, places) = tables.positions.split_at(dim);
     for f in 0..d.frames {
         let [image, features] = carve(scratch, patch_lens(config, d));
-        normaliser.apply(&images[f * d.pixels() * 3..][..d.pixels() * 3], image);
+        normaliser.apply_on(net.ctx.pool, &images[f * d.pixels() * 3..][..d.pixels() * 3], image);
         let out = HwcMut::new(features, d.rows, d.cols, dim);
         conv::conv2d(net.ctx, Hwc::new(image, d.height, d.width, 3), &embed, None, out);
         probe.emit(format_args!("patches"), Some(f), &[d.patches, dim], features);

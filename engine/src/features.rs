@@ -3,6 +3,7 @@
 
 use crate::dims::Dims;
 use sf_ops::mat::Mat;
+use std::ops::Range;
 
 /// Tokens that a head reads: `[frames * tokens, columns]` inside wider rows, registers first.
 #[derive(Clone, Copy)]
@@ -30,6 +31,12 @@ impl<'a> Features<'a> {
 
     fn rows_from(&self, row: usize, rows: usize) -> Mat<'a> {
         Mat::with_stride(&self.data[row * self.stride + self.stride - self.cols..], rows, self.cols, self.stride)
+    }
+
+    /// Those of some frames.
+    pub(crate) fn of(self, frames: Range<usize>) -> Features<'a> {
+        let frame = self.tokens * self.stride;
+        Features { data: &self.data[frames.start * frame..frames.end * frame], frames: frames.len(), ..self }
     }
 
     /// All tokens of all frames.

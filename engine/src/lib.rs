@@ -5,7 +5,7 @@
 //! | `model.rs` | [`Model`]: a weight blob and typed handles into it |
 //! | `session.rs` | [`Session`]: a model ready for clips of one shape; [`Options`] |
 //! | `dims.rs` | [`ClipShape`]: what a session is made for, checked once; its token counts |
-//! | `plan.rs` `arena.rs` | [`Plan`]: every size before the first frame; the one block of memory |
+//! | `plan.rs` `held.rs` `arena.rs` | [`Plan`]: every size before the first frame; what a session holds; the one block of memory |
 //! | `cost.rs` | [`Cost`]: the multiply-adds of a run, stage by stage |
 //! | `input.rs` `preprocess.rs` | [`Input`]: frames at the network's size; resizing to it |
 //! | `forward.rs` | the order of the network |
@@ -56,6 +56,7 @@ mod features;
 mod forward;
 mod gaussians;
 mod heads;
+mod held;
 mod input;
 mod intrinsics;
 mod model;

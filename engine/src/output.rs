@@ -6,6 +6,7 @@ use sf_formats::config::{ModelConfig, Sky};
 use sf_formats::scene::{Compose, SceneFrame, SplatSettings};
 use sf_formats::{Camera, Gaussians, Intrinsics, Pose, Result, Scene};
 use sf_ops::activation::sigmoid;
+use std::ops::Range;
 
 /// f32 values of an [`Output`] per pixel of the clip: points, depth, centre, scale, quaternion, opacity, colour,
 /// two velocities, dynamic probability; and the confidence where there is one.
@@ -58,6 +59,9 @@ pub struct Output {
     /// Whether each frame has a neighbour to see in the forward and in the backward direction; without
     /// one, its velocity in that direction is the other one mirrored (or the raw, untrained value).
     pub neighbours: Vec<(bool, bool)>,
+    /// Frames that this result is about: all of them, but after [`Session::push_newest`](crate::Session::push_newest) the last
+    /// one alone. Then the values of other frames are unspecified, but for their times and the first one's pose.
+    pub due: Range<usize>,
     /// What to know about this result.
     pub flags: Flags,
 }
@@ -94,6 +98,7 @@ impl Output {
             v_bwd: vectors()?,
             dynamic: scalars(n)?,
             neighbours: vec![(false, false); shape.frames],
+            due: 0..shape.frames,
             flags: Flags::default(),
         })
     }
@@ -104,11 +109,45 @@ impl Output {
         Camera { width, height, k: self.k[f], pose: self.poses[f] }
     }
 
+    /// What is said about frame `f`, as a result of one frame.
+    ///
+    /// # Panics
+    /// When the frame is not [`Output::due`].
+    pub fn of_frame(&self, f: usize) -> Output {
+        assert!(self.due.contains(&f), "frame {f} of a result about the frames {:?}", self.due);
+        let n = self.shape.height * self.shape.width;
+        let pixels = f * n..(f + 1) * n;
+        Output {
+            shape: ClipShape { frames: 1, ..self.shape },
+            times: vec![self.times[f]],
+            poses: vec![self.poses[f]],
+            k: vec![self.k[f]],
+            points: self.points[pixels.clone()].to_vec(),
+            depth: self.depth[pixels.clone()].to_vec(),
+            conf: if self.conf.is_empty() { Vec::new() } else { self.conf[pixels.clone()].to_vec() },
+            mean: self.mean[pixels.clone()].to_vec(),
+            scale: self.scale[pixels.clone()].to_vec(),
+            quat: self.quat[pixels.clone()].to_vec(),
+            opacity: self.opacity[pixels.clone()].to_vec(),
+            colour: self.colour[pixels.clone()].to_vec(),
+            v_fwd: self.v_fwd[pixels.clone()].to_vec(),
+            v_bwd: self.v_bwd[pixels.clone()].to_vec(),
+            dynamic: self.dynamic[pixels].to_vec(),
+            neighbours: vec![self.neighbours[f]],
+            due: 0..1,
+            flags: self.flags,
+        }
+    }
+
     /// Every pixel as a Gaussian, with cameras and the configured conventions.
     ///
     /// `sources` has one entry per frame, or is empty: then frames are numbered and have the network's
     /// size. `sky.mode` and `static.voxel` of the configuration are applied here.
+    ///
+    /// # Panics
+    /// When the result is about some of the frames only ([`Output::due`]).
     pub fn to_scene(&self, config: &ModelConfig, sources: &[FrameSource]) -> Scene {
+        assert!(self.due == (0..self.shape.frames), "a scene of a result about the frames {:?}", self.due);
         let own = (self.shape.width as u32, self.shape.height as u32);
         let frames = (0..self.shape.frames)
             .map(|f| {

@@ -17,6 +17,7 @@ use crate::causal;
 use crate::dims::{ClipShape, Dims};
 use crate::gaussians;
 use crate::heads;
+use crate::held;
 use crate::model::{Block, Decoder, DenseHead, Model};
 use crate::net::Rows;
 use sf_formats::config::{DepthMap, Head, HeadKind, ModelConfig, MotionLayout};
@@ -39,6 +40,11 @@ pub struct Plan {
     pub(crate) rows: usize,
     stages: Vec<(&'static str, usize)>,
     output_values: usize,
+    /// Values of working memory of each thread.
+    pub(crate) thread_values: usize,
+    table_values: usize,
+    /// Values kept of a frame that was pushed.
+    pub(crate) frame_values: usize,
     layers: u32,
     threads: usize,
 }
@@ -90,10 +96,13 @@ impl Plan {
             rows: rows(model, &dims),
             stages,
             output_values: n * dims.pixels() * crate::output::values_per_pixel(config),
+            thread_values: held::thread_values(model, &dims),
+            table_values: held::table_values(model, &dims),
+            frame_values: dims.tokens * dim,
             layers: layers(config, n),
             threads,
         };
-        let need = plan.arena_bytes() + plan.output_bytes();
+        let need = plan.session_bytes();
         if need > max_bytes {
             return Err(Error::resource(
                 "plan",
@@ -125,6 +134,21 @@ impl Plan {
         4 * (carved_len(self.areas) + self.rows) as u64
     }
 
+    /// Bytes of working memory of all threads.
+    pub fn threads_bytes(&self) -> u64 {
+        4 * (self.threads * self.thread_values) as u64
+    }
+
+    /// Bytes of the tables of the shape: positions and angles.
+    pub fn tables_bytes(&self) -> u64 {
+        4 * self.table_values as u64
+    }
+
+    /// Bytes that a session holds from its creation on: arena, working memory of the threads, tables, results.
+    pub fn session_bytes(&self) -> u64 {
+        self.arena_bytes() + self.threads_bytes() + self.tables_bytes() + self.output_bytes()
+    }
+
     /// Bytes of the results a session holds.
     pub fn output_bytes(&self) -> u64 {
         4 * self.output_values as u64
@@ -133,6 +157,12 @@ impl Plan {
     /// Bytes of the frames that a run reads.
     pub fn input_bytes(&self) -> u64 {
         3 * (self.dims.frames * self.dims.pixels()) as u64
+    }
+
+    /// Bytes that frames pushed one by one take beside: the pictures of the window, what is kept of them, the newest one's.
+    pub fn stream_bytes(&self) -> u64 {
+        let frames = self.dims.frames as u64;
+        self.input_bytes() + 8 * frames + 4 * (frames + 1) * self.frame_values as u64
     }
 
     /// Bytes of the scene made of the results, one Gaussian per pixel: centre, scale, quaternion, opacity, colour,
@@ -188,6 +218,8 @@ impl fmt::Display for Plan {
         if self.rows > 0 {
             writeln!(f, "  rows      {:9.2} MiB (input of an int8 layer)", mib(self.rows))?;
         }
+        writeln!(f, "threads     {:9.2} MiB of working memory", mib(self.threads * self.thread_values))?;
+        writeln!(f, "tables      {:9.2} MiB", mib(self.table_values))?;
         write!(f, "results     {:9.2} MiB", mib(self.output_values))
     }
 }

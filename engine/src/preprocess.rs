@@ -12,6 +12,7 @@ use sf_formats::config::{ModelConfig, Resample};
 use sf_formats::{Error, Intrinsics, Result};
 use sf_ops::cpu::DefaultFloatMode;
 use sf_ops::opclock::{self, Op, Work};
+use sf_ops::par::Pool;
 use sf_ops::resize::{Filter, resample_u8};
 
 /// Pixels per frame the public model was trained with at most (Pi3's loader).
@@ -154,6 +155,19 @@ impl Normaliser {
     pub(crate) fn apply(&self, bytes: &[u8], out: &mut [f32]) {
         assert_eq!(bytes.len(), out.len(), "bytes and values of an image");
         let _span = opclock::span(Op::Glue, || Work { macs: 0, bytes: 5 * out.len() as u64 });
+        self.pixels(bytes, out);
+    }
+
+    /// [`Normaliser::apply`] by the threads of a pool.
+    pub(crate) fn apply_on(&self, pool: &Pool, bytes: &[u8], out: &mut [f32]) {
+        // Pixels of a task: 48 KiB of values.
+        const TASK: usize = 1 << 12;
+        assert_eq!(bytes.len(), out.len(), "bytes and values of an image");
+        let _span = opclock::span(Op::Glue, || Work { macs: 0, bytes: 5 * out.len() as u64 });
+        pool.chunks(out, 3 * TASK, &|i, out, _| self.pixels(&bytes[3 * TASK * i..][..out.len()], out));
+    }
+
+    fn pixels(&self, bytes: &[u8], out: &mut [f32]) {
         for (from, to) in bytes.chunks_exact(3).zip(out.chunks_exact_mut(3)) {
             for c in 0..3 {
                 to[c] = self.0[c][usize::from(from[c])];

@@ -16,6 +16,7 @@ use crate::tables::Tables;
 use sf_formats::{Error, Intrinsics, Result};
 use sf_ops::cpu::{Ctx, DefaultFloatMode, Isa, Kernels};
 use sf_ops::par::Pool;
+use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -126,10 +127,12 @@ impl Session {
         let pool = Pool::new(threads)
             .map_err(|e| Error::resource("threads", format!("the system refused {threads} threads: {e}")))?;
         meet(&pool);
+        // First, so that what tables are made from is gone before the large areas come.
+        let tables = Tables::new(&model, &plan.dims);
+        pool.reserve_scratch(plan.thread_values);
         let arena = Arena::new(carved_len(plan.areas))?;
         let rows = Rows::new(plan.rows)?;
         let memory = Memory::new(&model, shape)?;
-        let tables = Tables::new(&model, &plan.dims);
         let cancel = Arc::new(AtomicBool::new(false));
         Ok(Session {
             model,
@@ -227,23 +230,24 @@ impl Session {
         let _mode = DefaultFloatMode::enter();
         self.times = Default::default();
         self.layers.store(0, Ordering::Relaxed);
-        self.forward(input, (None, seen), deadline, taps)?;
+        let due = 0..input.shape.frames;
+        self.forward(input, (None, due), (deadline, seen), taps)?;
         Ok(&self.memory.output)
     }
 
     fn forward(
         &mut self,
         input: &Input,
-        (encoded, seen): (Option<&[f32]>, Option<Seen>),
-        deadline: Option<Instant>,
+        (encoded, due): (Option<&[f32]>, Range<usize>),
+        (deadline, seen): (Option<Instant>, Option<Seen>),
         taps: Option<TapFn>,
     ) -> Result<()> {
         let [pairs, guide, motion, work] = carve(self.arena.all(), self.plan.areas);
         let net =
             Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows, seen };
-        let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input };
+        let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input, due };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline };
-        let mut probe = Probe::new(taps, watch, &mut self.times);
+        let mut probe = Probe::new(taps, watch, &self.pool, &mut self.times);
         self.complete = false;
         forward.run(Areas { pairs, guide, motion, work }, encoded, &mut self.memory, &mut probe)?;
         self.complete = true;
@@ -253,12 +257,34 @@ impl Session {
     /// Appends a frame to the session's window and runs the network on the last frames, as many as the
     /// session is planned for; `None` until there are enough.
     ///
-    /// Frames are encoded once and their tokens kept, so a step costs one frame of encoder instead of all;
-    /// the result has the same bits as [`Session::run`] on the same frames. The window (frames and their tokens)
+    /// Frames are encoded once and their tokens kept (after the first frame layer of alternating attention where the network's
+    /// tokens do not carry the time), so a step costs one frame of that instead of all; the result has the same bits as [`Session::run`] on the same frames. The window (frames and their tokens)
     /// is allocated by the first call, beside the plan's memory. `image` is `[height, width, 3]` at
     /// the network's size; `time` must be later than the last frame's. A frame that is refused or
     /// not encoded leaves the window as it was; when a later stage fails, the frame stays in it.
     pub fn push(&mut self, image: &[u8], time: f64, k: Option<Intrinsics>) -> Result<Option<&Output>> {
+        self.push_due(image, time, k, 0..self.plan.shape().frames)
+    }
+
+    /// [`Session::push`] for who wants results of the newest frame alone: its pose, intrinsics, depth, Gaussians, velocity and
+    /// dynamic probability have the bits of the whole window's, those of the other frames are not computed
+    /// ([`Output::due`]).
+    ///
+    /// The heads then run on one frame, and every causal layer on the frames that the newest one's motion still depends on.
+    /// Where one camera is fitted to the rays of all frames (`camera.k = fit_shared`) and `k` is `None`, depth is still computed for
+    /// all of them.
+    pub fn push_newest(&mut self, image: &[u8], time: f64, k: Option<Intrinsics>) -> Result<Option<&Output>> {
+        let n = self.plan.shape().frames;
+        self.push_due(image, time, k, n - 1..n)
+    }
+
+    fn push_due(
+        &mut self,
+        image: &[u8],
+        time: f64,
+        k: Option<Intrinsics>,
+        due: Range<usize>,
+    ) -> Result<Option<&Output>> {
         let shape = self.plan.shape();
         let one = ClipShape { frames: 1, ..shape };
         Input { shape: one, images: image, times: &[time], k }.check()?;
@@ -271,7 +297,7 @@ impl Session {
         let _mode = DefaultFloatMode::enter();
         self.times = Default::default();
         self.layers.store(0, Ordering::Relaxed);
-        let per_frame = self.plan.dims.tokens * self.model.config().aa.dim as usize;
+        let per_frame = self.plan.frame_values;
         let mut window = match self.window.take() {
             Some(window) => window,
             None => Window::new(shape, per_frame)?,
@@ -283,7 +309,7 @@ impl Session {
                 return Ok(false);
             }
             let input = Input { shape, images: &window.images, times: &window.times, k };
-            self.forward(&input, (Some(&window.tokens), None), None, None).map(|()| true)
+            self.forward(&input, (Some(&window.tokens), due), (None, None), None).map(|()| true)
         });
         self.window = Some(window);
         Ok(result?.then_some(&self.memory.output))
@@ -307,7 +333,7 @@ impl Session {
             seen: None,
         };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline: None };
-        let mut probe = Probe::new(None, watch, &mut self.times);
+        let mut probe = Probe::new(None, watch, &self.pool, &mut self.times);
         forward::encode_frame(net, &self.plan, &self.tables, image, (work, &mut window.newest), &mut probe)
     }
 

@@ -105,7 +105,8 @@ pub(crate) fn causal_tokens(config: &ModelConfig) -> Tokens {
 /// The stored table `[1 + grid^2, dim]` resized to a patch grid: `[1 + rows cols, dim]`.
 pub(crate) fn positions(config: &ModelConfig, stored: &[f32], rows: usize, cols: usize) -> Vec<f32> {
     let (dim, grid) = (config.encoder.dim as usize, config.pos_grid as usize);
-    let mut out = stored[..dim].to_vec();
+    let mut out = Vec::with_capacity((1 + rows * cols) * dim);
+    out.extend_from_slice(&stored[..dim]);
     out.extend(sf_ops::resize::position_table(&stored[dim..], grid, dim, (rows, cols)));
     out
 }

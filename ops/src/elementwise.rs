@@ -87,17 +87,41 @@ pub fn pixel_shuffle_beside(ctx: Ctx, x: Mat, grid: (usize, usize), p: usize, be
         return;
     }
     let _span = opclock::span(Op::Resize, || Work::values(out.data.len()));
-    // One task per output line.
-    ctx.pool.chunks(out.data, line, &|oy, piece, _| {
-        for (px, patch) in piece.chunks_exact_mut(p * all).enumerate() {
-            let row = &x.row(oy / p * pw + px)[oy % p * p..];
-            for (dx, pixel) in patch.chunks_exact_mut(all).enumerate() {
-                let (own, others) = pixel.split_at_mut(c);
-                for (ch, v) in own.iter_mut().enumerate() {
-                    *v = row[ch * p * p + dx];
+    // One task per line of patches: p output lines.
+    ctx.pool.chunks(out.data, p * line, &|py, piece, _| {
+        for px in 0..pw {
+            let row = x.row(py * pw + px);
+            match p {
+                2 => spread::<2>(row, piece, (line, px, all)),
+                7 => spread::<7>(row, piece, (line, px, all)),
+                14 => spread::<14>(row, piece, (line, px, all)),
+                _ => {
+                    for (i, &v) in row.iter().enumerate() {
+                        piece[i / p % p * line + (px * p + i % p) * all + i / (p * p)] = v;
+                    }
                 }
-                others.copy_from_slice(&beside.data[(oy * width + px * p + dx) * g..][..g]);
+            }
+        }
+        if g > 0 {
+            let beside = &beside.data[py * p * width * g..][..p * width * g];
+            for (pixel, others) in piece.chunks_exact_mut(all).zip(beside.chunks_exact(g)) {
+                pixel[c..].copy_from_slice(others);
             }
         }
     });
+}
+
+/// One patch of [`pixel_shuffle_beside`] with `P` pixels a side into its P output lines of `line` values: the usual sides
+/// are known at compile time, so that the inner loops are straight runs.
+fn spread<const P: usize>(row: &[f32], lines: &mut [f32], (line, px, all): (usize, usize, usize)) {
+    for dy in 0..P {
+        let patch = &mut lines[dy * line + px * P * all..][..P * all];
+        for (ch, values) in row.chunks_exact(P * P).enumerate() {
+            let from: &[f32; P] = values[dy * P..].first_chunk().expect("a line of a patch");
+            let to = &mut patch[ch..][..(P - 1) * all + 1];
+            for dx in 0..P {
+                to[dx * all] = from[dx];
+            }
+        }
+    }
 }

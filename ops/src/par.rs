@@ -1,8 +1,9 @@
 //! The thread pool of the network: fixed threads, numbered tasks, no allocation after creation.
 //!
-//! A region is `pool.run(tasks, f)`: `f(task, worker)` is called once for every task. Tasks are taken from a
-//! shared counter, so which worker runs a task is open; what a task computes must therefore not
-//! depend on it. The caller is worker 0.
+//! A region is `pool.run(tasks, f)`: `f(task, worker)` is called once for every task. Every worker begins with its own share
+//! of the tasks (the first worker with the first ones) and then helps the others, so which worker runs a task is open; what a task
+//! computes must therefore not depend on it. The caller is worker 0. Shares keep rows at home: the operations of a network cut the
+//! same rows into tasks one after the other, and what a core wrote lies in its own second-level cache.
 //!
 //! One word holds the state of the pool: an epoch, an *open* bit and the number of workers inside.
 //! A worker joins an open region that it has not seen yet; the caller closes the region when no task
@@ -37,10 +38,19 @@ thread_local! {
     static IN_TASK: Cell<bool> = const { Cell::new(false) };
 }
 
+/// First task of worker `w`'s share.
+fn share_start(tasks: usize, workers: usize, w: usize) -> usize {
+    (tasks as u128 * w as u128 / workers as u128) as usize
+}
+
 /// A mutex whose data stay valid whatever panicked while it was held.
 fn lock<T>(m: &Mutex<T>) -> MutexGuard<'_, T> {
     m.lock().unwrap_or_else(PoisonError::into_inner)
 }
+
+/// A counter on cache lines of its own; they are fetched in pairs.
+#[repr(align(128))]
+struct Next(AtomicUsize);
 
 struct Shared {
     /// Epoch, open bit, workers inside.
@@ -48,7 +58,8 @@ struct Shared {
     stop: AtomicBool,
     /// The open region's closure and task count. Written only while the region is closed and empty.
     job: UnsafeCell<(*const Task<'static>, usize)>,
-    next: AtomicUsize,
+    /// The next task of every worker's share.
+    next: Box<[Next]>,
     /// `parked[w]`: worker w + 1 sleeps or is about to.
     parked: Box<[AtomicBool]>,
     /// The caller sleeps or is about to.
@@ -70,17 +81,21 @@ impl Shared {
     fn work(&self, f: &Task<'_>, tasks: usize, worker: usize) {
         IN_TASK.set(true);
         let result = catch_unwind(AssertUnwindSafe(|| {
-            loop {
-                let task = self.next.fetch_add(1, SeqCst);
-                if task >= tasks {
-                    return;
+            let shares = self.next.len();
+            for share in (worker..shares).chain(0..worker) {
+                let end = share_start(tasks, shares, share + 1);
+                loop {
+                    let task = self.next[share].0.fetch_add(1, SeqCst);
+                    if task >= end {
+                        break;
+                    }
+                    f(task, worker);
                 }
-                f(task, worker);
             }
         }));
         IN_TASK.set(false);
         if let Err(payload) = result {
-            self.next.store(tasks, SeqCst);
+            self.next.iter().for_each(|next| next.0.store(tasks, SeqCst));
             lock(&self.panic).get_or_insert(payload);
         }
     }
@@ -168,7 +183,7 @@ impl Pool {
             state: AtomicU64::new(0),
             stop: AtomicBool::new(false),
             job: UnsafeCell::new((&|_: usize, _: usize| {}, 0)),
-            next: AtomicUsize::new(0),
+            next: (0..threads).map(|_| Next(AtomicUsize::new(0))).collect(),
             parked: (1..threads).map(|_| AtomicBool::new(false)).collect(),
             caller_parked: AtomicBool::new(false),
             caller: Mutex::new(None),
@@ -210,7 +225,8 @@ impl Pool {
         }
         let _turn = lock(&self.gate);
         let s = &*self.shared;
-        s.next.store(0, SeqCst);
+        let shares = s.next.len();
+        s.next.iter().enumerate().for_each(|(w, next)| next.0.store(share_start(tasks, shares, w), SeqCst));
         if tasks == 1 || self.workers.is_empty() {
             s.work(f, tasks, 0);
         } else {

@@ -48,8 +48,8 @@ impl RopeTable {
         assert!(head_dim.is_multiple_of(4) && head_dim > 0, "head width {head_dim} is not a multiple of 4");
         let quarter = head_dim / 4;
         let inverse: Vec<f64> = (0..quarter).map(|m| trig::pow(base, -(m as f64) / quarter as f64)).collect();
-        let mut cos = Vec::with_capacity(positions.len() * 2 * quarter);
-        let mut sin = Vec::with_capacity(positions.len() * 2 * quarter);
+        let values = positions.len() * 2 * quarter + LANES;
+        let (mut cos, mut sin) = (Vec::with_capacity(values), Vec::with_capacity(values));
         for &(row, col) in positions {
             for position in [row, col] {
                 for w in &inverse {

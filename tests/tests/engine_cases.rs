@@ -3,13 +3,14 @@
 
 use sf_formats::blob::Dtype;
 use sf_formats::clip::{Clip, ClipOptions};
-use sf_formats::config::{Extrapolate, Head, ModelConfig};
+use sf_formats::config::{Anchor, Extrapolate, Head, KSource, ModelConfig, Order};
 use sf_formats::{Intrinsics, Status};
+use sf_tests::int8::converted;
 use sf_tests::tiny::{Frames, model, session, stages, tensors, tiny, tiny_guided};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
-use streetforward::{ClipShape, Input, Options, Prepared, Session};
+use streetforward::{ClipShape, Input, Model, Options, Prepared, Session};
 
 #[test]
 fn i14_one_frame_stands_still() {
@@ -70,7 +71,7 @@ fn i16_more_than_the_budget_is_refused_with_numbers() {
     // The plan's number is the budget that just suffices.
     let shape = ClipShape { frames: 2, height: 28, width: 42 };
     let plan = session(&model, shape).plan().clone();
-    let need = plan.arena_bytes() + plan.output_bytes();
+    let need = plan.session_bytes();
     let options = Options { threads: 2, max_bytes: need, ..Options::default() };
     let mut session = Session::new(Arc::clone(&model), shape, options).unwrap();
     let options = Options { max_bytes: need - 1, ..options };
@@ -294,16 +295,24 @@ fn a_failed_run_leaves_no_result() {
 /// Frames that arrive one by one: every window has the bits of a run from scratch.
 #[test]
 fn a_stream_has_the_bits_of_its_windows() {
-    for config in [tiny(), tiny_guided()] {
-        stream_and_windows(&config);
+    let linear = tiny().with_linear_heads();
+    let own = ModelConfig { render_extrapolate: Extrapolate::Direct, mask_k: 2, ..linear.clone() };
+    let strict = ModelConfig { mask_self: false, camera_k: KSource::FitFrame, causal_share: false, ..tiny() };
+    let raw = ModelConfig { aa_order: Order::GlobalFirst, world_anchor: Anchor::Raw, ..tiny() };
+    for config in [tiny(), tiny_guided(), linear, own, strict, raw] {
+        stream_and_windows(&model(&config, &tensors(&config, 16), Dtype::F32));
+    }
+    let int8 = sf_tests::int8::tiny();
+    for config in [int8.clone(), int8.with_linear_heads()] {
+        stream_and_windows(&converted(&config, &tensors(&config, 16), sf_quant::Options::to(Dtype::Int8)));
     }
 }
 
-fn stream_and_windows(config: &ModelConfig) {
-    let model = model(config, &tensors(config, 16), Dtype::F32);
+fn stream_and_windows(model: &Arc<Model>) {
     let drive = Frames::new(6, 28, 42, 16);
     let shape = ClipShape { frames: 3, ..drive.shape };
-    let (mut stream, mut scratch) = (session(&model, shape), session(&model, shape));
+    let (mut stream, mut scratch) = (session(model, shape), session(model, shape));
+    let mut newest = session(model, shape);
     let frame = |f: usize| &drive.images[f * 28 * 42 * 3..][..28 * 42 * 3];
     for f in 0..6 {
         let out = stream.push(frame(f), drive.times[f], None).unwrap().cloned();
@@ -311,7 +320,20 @@ fn stream_and_windows(config: &ModelConfig) {
         if let Some(out) = out {
             let images = &drive.images[(f - 2) * 28 * 42 * 3..][..3 * 28 * 42 * 3];
             let input = Input { shape, images, times: &drive.times[f - 2..=f], k: None };
-            assert_eq!(*scratch.run(&input).unwrap(), out, "window that ends with frame {f}");
+            assert!(*scratch.run(&input).unwrap() == out, "window that ends with frame {f}");
+            // The newest frame alone says the same about it.
+            let alone = newest.push_newest(frame(f), drive.times[f], None).unwrap().unwrap();
+            assert_eq!(alone.due, 2..3);
+            // What is said about the intrinsics is about the frames that are due.
+            assert!(out.flags.intrinsics_assumed || !alone.flags.intrinsics_assumed);
+            let of_frame = |out: &streetforward::Output| streetforward::Output {
+                flags: streetforward::Flags { no_motion: out.flags.no_motion, intrinsics_assumed: false },
+                ..out.of_frame(2)
+            };
+            assert!(of_frame(alone) == of_frame(&out), "newest frame {f}");
+            assert_eq!((alone.poses[0], &alone.times), (out.poses[0], &out.times));
+        } else {
+            assert!(newest.push_newest(frame(f), drive.times[f], None).unwrap().is_none());
         }
         // Refused frames leave no trace.
         assert_eq!(stream.push(frame(0), drive.times[f], None).unwrap_err().status(), Status::Input);

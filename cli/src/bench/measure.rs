@@ -193,22 +193,36 @@ impl Pacer {
 pub(crate) struct Pushed {
     /// `Session::push` on a full window.
     pub(crate) push: Vec<Duration>,
+    /// `Session::push_newest` on a full window.
+    pub(crate) newest: Vec<Duration>,
     /// `Session::run`.
     pub(crate) whole: Vec<Duration>,
 }
 
 /// Pushes the clip's frames again and again, each step beside a run of the whole; the clip pushed frame by frame must give
-/// what the run gave, whose digest is `digest`.
+/// what the run gave, whose digest is `digest`, and pushed for its newest frame alone what the run gave about that.
 pub(crate) fn push(session: &mut Session, input: &Input, schedule: &Schedule, digest: Digest) -> Result<Pushed> {
     let (n, len) = (input.shape.frames, input.shape.height * input.shape.width * 3);
-    for (image, &time) in input.images.chunks_exact(len).zip(input.times) {
-        session.push(image, time, None)?;
-    }
-    if output_digest(session.output()) != digest {
-        return Err(Error::Internal("a clip pushed frame by frame gave another result than the clip at once".into()));
+    let newest = output_digest(&session.output().of_frame(n - 1));
+    for alone in [true, false] {
+        session.restart();
+        for (image, &time) in input.images.chunks_exact(len).zip(input.times) {
+            match alone {
+                true => session.push_newest(image, time, None)?,
+                false => session.push(image, time, None)?,
+            };
+        }
+        let (have, want) = match alone {
+            true => (output_digest(&session.output().of_frame(n - 1)), newest),
+            false => (output_digest(session.output()), digest),
+        };
+        if have != want {
+            let why = "a clip pushed frame by frame gave another result than the clip at once";
+            return Err(Error::Internal(why.into()));
+        }
     }
     let start = Instant::now();
-    let mut pushed = Pushed { push: Vec::new(), whole: Vec::new() };
+    let mut pushed = Pushed { push: Vec::new(), newest: Vec::new(), whole: Vec::new() };
     let mut time = input.times[n - 1];
     let wanted = schedule.runs.map_or(usize::MAX, |r| r as usize);
     let late = || schedule.seconds.is_some_and(|s| start.elapsed().as_secs_f64() >= s);
@@ -218,6 +232,10 @@ pub(crate) fn push(session: &mut Session, input: &Input, schedule: &Schedule, di
         let clock = Instant::now();
         session.push(&input.images[frame * len..][..len], time, None)?;
         pushed.push.push(clock.elapsed());
+        time += 0.1;
+        let clock = Instant::now();
+        session.push_newest(&input.images[frame * len..][..len], time, None)?;
+        pushed.newest.push(clock.elapsed());
         let clock = Instant::now();
         session.run(input)?;
         pushed.whole.push(clock.elapsed());

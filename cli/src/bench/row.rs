@@ -46,8 +46,8 @@ pub(crate) struct Row {
     /// Place of the slowest run among those that count.
     pub(crate) worst_run: usize,
     pub(crate) profile: Option<(Accounts, Duration)>,
-    /// One new frame a step, and the whole window in between.
-    pub(crate) push: Option<(Samples, Samples)>,
+    /// One new frame a step with the results of all frames, with those of the newest, and the whole window in between.
+    pub(crate) push: Option<[Samples; 3]>,
     pub(crate) digest: Digest,
 }
 
@@ -149,8 +149,11 @@ impl Row {
             put("response_p99_ms", json!(self.responses.percentile(Percentile(99.0))));
             put("response_max_ms", json!(self.responses.max()));
         }
-        if let Some((push, whole)) = &self.push {
+        if let Some([push, newest, whole]) = &self.push {
             put("push_p50_ms", json!(push.median()));
+            put("push_newest_p50_ms", json!(newest.median()));
+            put("push_newest_p50_low_ms", json!(newest.median_interval().map(|i| i.0)));
+            put("push_newest_p50_high_ms", json!(newest.median_interval().map(|i| i.1)));
             put("push_p50_low_ms", json!(push.median_interval().map(|i| i.0)));
             put("push_p50_high_ms", json!(push.median_interval().map(|i| i.1)));
             put("push_whole_p50_ms", json!(whole.median()));
@@ -298,15 +301,19 @@ pub(crate) fn tables(rows: &[Row], percentiles: &[Percentile]) -> String {
         if row.pace.is_some() || row.deadline.is_some() {
             text.push_str(&format!("\nrow {}: {}\n", i + 1, row.pace_text()));
         }
-        if let Some((push, whole)) = &row.push {
-            let times = [push, whole].map(|s| millis(Some(s.median())));
+        if let Some(push) = &row.push {
+            let [all, newest, whole] = push.each_ref().map(Samples::median);
+            let times = [all, newest, whole].map(|t| millis(Some(t)));
             text.push_str(&format!(
-                "\nrow {}: one new frame a step {} ms, the whole window {} ms in between, {:.2} times; {} steps, same bits\n",
+                "\nrow {}: one new frame a step {} ms ({:.2} times faster), for the newest frame's results {} ms ({:.2} times), \
+                 the whole window {} ms in between; {} steps, same bits\n",
                 i + 1,
                 times[0],
+                whole / all,
                 times[1],
-                whole.median() / push.median(),
-                push.len(),
+                whole / newest,
+                times[2],
+                push[0].len(),
             ));
         }
         if let Some((_, total)) = row.profile {

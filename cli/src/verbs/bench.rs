@@ -450,7 +450,7 @@ impl Case<'_> {
             profile,
             push: push.map(|p| {
                 let samples = |times: Vec<Duration>| Samples::new(times.into_iter().map(ms).collect());
-                (samples(p.push), samples(p.whole))
+                [p.push, p.newest, p.whole].map(samples)
             }),
             digest: measured.digest,
         };

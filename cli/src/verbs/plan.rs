@@ -65,10 +65,10 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let weights = loaded.model.blob().file_bytes() as u64;
     // What this program holds beside the weights, which were all read for their digests: code, tables, the allocator.
     let own = machine::rss_bytes().unwrap_or(0).saturating_sub(weights);
-    let network = weights + plan.arena_bytes() + plan.output_bytes() + plan.input_bytes() + own;
+    let network = weights + plan.session_bytes() + plan.input_bytes() + own;
     let total = network + plan.scene_bytes();
     let budget = args.engine.max_mem.unwrap_or(DEFAULT_MAX_BYTES);
-    let session = plan.arena_bytes() + plan.output_bytes();
+    let session = plan.session_bytes();
     let free = Machine::probe().free_bytes();
     let fits_budget = session <= budget;
     // The process and the weights are in memory already.
@@ -104,6 +104,8 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         "arena_bytes": plan.arena_bytes(),
         "arena": areas(&plan.areas_bytes()),
         "work": areas(&plan.work_bytes()),
+        "threads_bytes": plan.threads_bytes(),
+        "tables_bytes": plan.tables_bytes(),
         "output_bytes": plan.output_bytes(),
         "input_bytes": plan.input_bytes(),
         "process_bytes": own,
@@ -139,7 +141,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         ("peak", total),
     ] {
         let sum = match name {
-            "network" => " = arena + results + weights + pictures + process",
+            "network" => " = arena + threads + tables + results + weights + pictures + process",
             "peak" => " = network + scene",
             _ => "",
         };
@@ -147,7 +149,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     }
     let answer = |fits: bool| if fits { "fits" } else { "DOES NOT FIT" };
     text.push_str(&format!(
-        "budget      {}: arena and results take {} of {} (--max-mem)\n",
+        "budget      {}: arena, threads, tables and results take {} of {} (--max-mem)\n",
         answer(fits_budget),
         human_bytes(session),
         human_bytes(budget)

@@ -85,6 +85,9 @@ pub(crate) struct Args {
     /// Files to write: depth (16-bit pictures of the newest frame), scene (of the window)
     #[arg(long, value_enum, value_delimiter = ',', value_name = "LIST", default_value = "depth", requires = "output")]
     emit: Vec<Emit>,
+    /// Results of the newest picture alone: the same, in a part of the time; no poses of the others, no scenes
+    #[arg(long)]
+    newest: bool,
     /// A scene for every N-th step
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..), requires = "output")]
     scene_every: u64,
@@ -144,6 +147,9 @@ impl Feed {
 
 /// Runs until the pictures end.
 pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
+    if args.newest && args.emit.contains(&Emit::Scene) {
+        return Err(Error::usage("--newest has no scene: it gives the results of one picture"));
+    }
     let (mut feed, video_fps) = open(args)?;
     let files = args.output.as_deref().map(|folder| Files::create(folder, args)).transpose()?;
     let loaded = model::load(args.model.as_deref(), &args.engine, args.precision, console)?;
@@ -186,7 +192,11 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
         came += 1;
         index += 1;
         let start = Instant::now();
-        let Some(out) = session.push(&prepared.images, time, None)? else { continue };
+        let pushed = match args.newest {
+            true => session.push_newest(&prepared.images, time, None)?,
+            false => session.push(&prepared.images, time, None)?,
+        };
+        let Some(out) = pushed else { continue };
         let run_ms = start.elapsed().as_secs_f64() * 1e3;
         let latency_ms = picture.seen.elapsed().as_secs_f64() * 1e3;
         let missed = args.deadline_ms.is_some_and(|d| latency_ms > d);
@@ -212,7 +222,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
             "name": name,
             "time_s": time,
             "pose": out.poses[last].to_rows(),
-            "poses": out.poses.iter().map(|p| json!(p.to_rows())).collect::<serde_json::Value>(),
+            "poses": (out.due == (0..window)).then(|| out.poses.iter().map(|p| json!(p.to_rows())).collect::<serde_json::Value>()),
             "times_s": out.times,
             "intrinsics": [k.fx, k.fy, k.cx, k.cy],
             "width": own.0,

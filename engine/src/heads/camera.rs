@@ -39,11 +39,11 @@ pub(crate) fn scratch_len(camera: &model::Camera, d: &Dims, threads: usize) -> u
     carved_len(lens(camera, d, threads))
 }
 
-/// Poses of all frames into `out`.
+/// Poses of the frames of `x` into `out`; `d` counts those frames, of which `first` is the first.
 pub(crate) fn run(
     net: Net,
     (d, tables): (&Dims, &Tables),
-    x: Features,
+    (x, first): (Features, usize),
     scratch: &mut [f32],
     out: &mut [RawCamera],
     probe: &mut Probe,
@@ -62,10 +62,7 @@ pub(crate) fn run(
             net.linear_onto(l3, Act::Relu, None, Mat::new(h2, n, width), MatMut::new(x, n, width));
         }
         let (mean, a) = (&mut h1[..width], &mut h2[..width]);
-        for (c, m) in mean.iter_mut().enumerate() {
-            let sum: f64 = x.iter().skip(c).step_by(width).map(|&v| f64::from(v)).sum();
-            *m = (sum / n as f64) as f32;
-        }
+        average(x, width, mean);
         let row = |l: &Linear, act, from: &[f32], to: &mut [f32]| {
             let n = to.len();
             net.linear(l, act, Mat::new(from, 1, from.len()), MatMut::new(to, 1, n));
@@ -81,8 +78,42 @@ pub(crate) fn run(
         probe.guard(format_args!("camera"), &raw.t)?;
         probe.guard(format_args!("camera"), &raw.nine)?;
         probe.guard(format_args!("camera"), &raw.fov)?;
-        probe.emit(format_args!("camera.t"), Some(f), &[3], &raw.t);
-        probe.emit(format_args!("camera.rot9"), Some(f), &[9], &raw.nine);
+        probe.emit(format_args!("camera.t"), Some(first + f), &[3], &raw.t);
+        probe.emit(format_args!("camera.rot9"), Some(first + f), &[9], &raw.nine);
     }
     Ok(())
+}
+
+/// Means of the columns of `x` `[rows, width]`, each summed from the first row to the last in f64.
+fn average(x: &[f32], width: usize, out: &mut [f32]) {
+    let n = x.len() / width;
+    // A cache line of columns at a time.
+    for (i, means) in out.chunks_mut(16).enumerate() {
+        let mut sums = [0.0f64; 16];
+        for row in x.chunks_exact(width) {
+            for (sum, &v) in sums.iter_mut().zip(&row[16 * i..][..means.len()]) {
+                *sum += f64::from(v);
+            }
+        }
+        means.iter_mut().zip(sums).for_each(|(m, sum)| *m = (sum / n as f64) as f32);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn means_are_those_of_the_columns_in_order() {
+        for width in [1, 16, 21, 40] {
+            let x: Vec<f32> =
+                (0..7 * width).map(|i| ((i * 37 % 101) as f32 - 50.0) * 1.7e3f32.powi(i as i32 % 3)).collect();
+            let mut have = vec![9.0; width];
+            average(&x, width, &mut have);
+            for c in 0..width {
+                let sum: f64 = x.iter().skip(c).step_by(width).map(|&v| f64::from(v)).sum();
+                assert_eq!(have[c], (sum / 7.0) as f32, "column {c} of {width}");
+            }
+        }
+    }
 }

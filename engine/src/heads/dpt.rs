@@ -17,7 +17,9 @@ use crate::dims::Dims;
 use crate::features::Features;
 use crate::model::{Dpt, Unit};
 use crate::net::{ConvLayer, Net};
+use crate::probe::Probe;
 use crate::tables::DptTables;
+use sf_formats::Result;
 use sf_formats::config::RcuSkip;
 use sf_ops::conv;
 use sf_ops::elementwise::{add_assign, relu};
@@ -104,7 +106,7 @@ impl Layers<'_> {
 }
 
 /// The raw map of one frame.
-pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyramid) {
+pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyramid, probe: &Probe) -> Result<()> {
     let layers = Layers { net, head };
     let sizes = levels(d);
     let f = head.features;
@@ -145,6 +147,7 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
             }
         };
         net.conv(ConvLayer::same(&head.lateral[i], 3), x, None, HwcMut::new(out, s.0, s.1, f));
+        probe.check(format_args!("level {i} of a pyramid"))?;
     }
 
     // Fusion: c holds what came from the coarser level; a is each unit's hidden map.
@@ -155,11 +158,13 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
         match &fusion.lateral {
             Some(unit) => {
                 layers.unit(unit, s, lateral[i], a, b);
+                probe.check(format_args!("a unit of a pyramid"))?;
                 add_assign(net.ctx, &mut b[..n], &c[..n]);
                 layers.unit(&fusion.unit, s, b, a, c);
             }
             None => layers.unit(&fusion.unit, s, lateral[i], a, c),
         }
+        probe.check(format_args!("a unit of a pyramid"))?;
         let out = HwcMut::new(&mut a[..n], s.0, s.1, f);
         net.conv(ConvLayer::same(&fusion.out, 1), Hwc::new(&c[..n], s.0, s.1, f), None, out);
         let from = Hwc::new(&a[..n], s.0, s.1, f);
@@ -171,6 +176,7 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
     let small = &mut a[..area(s) * half];
     let fused = Hwc::new(&c[..area(s) * f], s.0, s.1, f);
     net.conv(ConvLayer::same(&head.output1, 3), fused, None, HwcMut::new(small, s.0, s.1, half));
+    probe.check(format_args!("a pyramid"))?;
     let full = &mut b[..d.pixels() * half];
     let to = HwcMut::new(full, d.height, d.width, half);
     bilinear(net.ctx, Hwc::new(small, s.0, s.1, half), Corners::Aligned, to);
@@ -181,4 +187,5 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
     net.conv(second, Hwc::new(full, d.height, d.width, half), None, to);
     let hidden = Hwc::new(hidden, d.height, d.width, head.hidden);
     net.conv(ConvLayer::same(&head.last, 1), hidden, None, HwcMut::new(job.out, d.height, d.width, head.out));
+    Ok(())
 }

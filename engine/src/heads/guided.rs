@@ -71,7 +71,7 @@ pub(crate) struct Paint<'a> {
 }
 
 /// The raw map of one frame.
-pub(crate) fn frame(net: Net, head: &Guided, d: &Dims, job: Paint) {
+pub(crate) fn frame(net: Net, head: &Guided, d: &Dims, job: Paint, probe: &Probe) -> Result<()> {
     let Paint { frame, per_frame, guide, scratch, out } = job;
     let [decoded, work] = carve(scratch, lens(head, d, per_frame, net.ctx.pool.threads()));
     let [a, b, c] = carve(work, map_lens(head, d));
@@ -94,12 +94,15 @@ pub(crate) fn frame(net: Net, head: &Guided, d: &Dims, job: Paint) {
     let [conv0, conv1, conv2, conv3] = head.convs.each_ref().map(|weights| ConvLayer::same(weights, 3));
     let joined = Hwc::new(&b[..pixels * inputs], h, w, inputs);
     net.conv(ConvLayer { act: Act::Relu, ..conv0 }, joined, None, HwcMut::new(a, h, w, f));
+    probe.check(format_args!("the first convolution of a guided head"))?;
     let x = Hwc::new(a, h, w, f);
     net.conv(ConvLayer { act: Act::Relu, ..conv1 }, x, None, HwcMut::new(&mut b[..pixels * f], h, w, f));
     net.conv(conv2, Hwc::new(&b[..pixels * f], h, w, f), Some(x), HwcMut::new(c, h, w, f));
+    probe.check(format_args!("the third convolution of a guided head"))?;
     let outputs = &mut b[..pixels * 4 * head.out];
     let last = ConvLayer { relu_input: Act::Relu, ..conv3 };
     net.conv(last, Hwc::new(c, h, w, f), None, HwcMut::new(outputs, h, w, 4 * head.out));
     let out = HwcMut::new(out, d.height, d.width, head.out);
     pixel_shuffle(net.ctx, Mat::new(outputs, pixels, 4 * head.out), (h, w), 2, out);
+    Ok(())
 }

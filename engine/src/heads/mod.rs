@@ -71,19 +71,28 @@ impl Dense<'_> {
     }
 
     /// The raw map of one frame, `[height, width, channels]`.
-    pub(crate) fn frame(&self, source: Source, frame: usize, scratch: &mut [f32], out: &mut [f32]) {
+    ///
+    /// Cancelling and deadlines are looked at inside, too: a map may take many times as long as a block.
+    pub(crate) fn frame(
+        &self,
+        source: Source,
+        frame: usize,
+        (scratch, out): (&mut [f32], &mut [f32]),
+        probe: &Probe,
+    ) -> Result<()> {
         match (self.head, source) {
             (DenseHead::Linear(head), Source::Tokens(x)) => {
                 linear::frame(self.net, head, self.dims, self.job(x).per_frame(self.dims), (frame, scratch, out));
+                Ok(())
             }
             (DenseHead::Guided(head), Source::Tokens(x)) => {
                 let per_frame = self.job(x).per_frame(self.dims);
                 let job = guided::Paint { frame, per_frame, guide: self.guide, scratch, out };
-                guided::frame(self.net, head, self.dims, job);
+                guided::frame(self.net, head, self.dims, job, probe)
             }
             (DenseHead::Dpt(head), Source::Taps(taps)) => {
                 let tables = self.dpt.expect("a pyramid has its position tables");
-                dpt::frame(self.net, head, tables, self.dims, dpt::Pyramid { taps, frame, scratch, out });
+                dpt::frame(self.net, head, tables, self.dims, dpt::Pyramid { taps, frame, scratch, out }, probe)
             }
             _ => unreachable!("the source is chosen by the kind of the head"),
         }

@@ -13,6 +13,7 @@ use sf_formats::Result;
 use sf_ops::conv::{self, Conv};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Hwc, HwcMut};
+use std::ops::Range;
 
 /// Values of [`run`]'s result.
 pub(crate) fn values(stem: Option<&Linear>, d: &Dims) -> usize {
@@ -24,11 +25,11 @@ pub(crate) fn scratch_len(d: &Dims) -> usize {
     3 * d.pixels()
 }
 
-/// The stem of all frames into `guide`; `images` are bytes, `[frames, height, width, 3]`.
+/// The stem of the frames `due` into their places in `guide`; `images` are bytes, `[frames, height, width, 3]`.
 pub(crate) fn run(
     net: Net,
     d: &Dims,
-    images: &[u8],
+    (images, due): (&[u8], Range<usize>),
     (scratch, guide): (&mut [f32], &mut [f32]),
     probe: &mut Probe,
 ) -> Result<()> {
@@ -45,8 +46,8 @@ pub(crate) fn run(
         act: Act::Relu,
     };
     let image = &mut scratch[..scratch_len(d)];
-    for (f, out) in guide.chunks_exact_mut(h * w * channels).enumerate() {
-        normaliser.apply(&images[f * d.pixels() * 3..][..d.pixels() * 3], image);
+    for (f, out) in guide.chunks_exact_mut(h * w * channels).enumerate().take(due.end).skip(due.start) {
+        normaliser.apply_on(net.ctx.pool, &images[f * d.pixels() * 3..][..d.pixels() * 3], image);
         let image = Hwc::new(image, d.height, d.width, 3);
         conv::conv2d(net.ctx, image, &conv, None, HwcMut::new(out, h, w, channels));
         probe.guard(format_args!("guide"), out)?;

@@ -3,12 +3,13 @@
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::ffi::{c_int, c_void};
-use std::sync::atomic::{AtomicI32, AtomicPtr, AtomicUsize, Ordering::SeqCst};
+use std::sync::atomic::{AtomicI32, AtomicIsize, AtomicPtr, AtomicUsize, Ordering::SeqCst};
 
 struct Counting;
 
 static CALLS: AtomicUsize = AtomicUsize::new(0);
 static BYTES: AtomicUsize = AtomicUsize::new(0);
+static HELD: AtomicIsize = AtomicIsize::new(0);
 static THREADS: AtomicUsize = AtomicUsize::new(0);
 /// A thread that is not counted; 0: all are.
 static IGNORED: AtomicI32 = AtomicI32::new(0);
@@ -36,13 +37,20 @@ pub(crate) struct Counts {
     pub(crate) calls: usize,
     /// Bytes asked for.
     pub(crate) bytes: usize,
+    /// Bytes asked for and not yet given back, of all threads; frees of what was there before the process counted make it negative.
+    pub(crate) held: isize,
     /// Threads started.
     pub(crate) threads: usize,
 }
 
 /// The counts now.
 pub(crate) fn counts() -> Counts {
-    Counts { calls: CALLS.load(SeqCst), bytes: BYTES.load(SeqCst), threads: THREADS.load(SeqCst) }
+    Counts {
+        calls: CALLS.load(SeqCst),
+        bytes: BYTES.load(SeqCst),
+        held: HELD.load(SeqCst),
+        threads: THREADS.load(SeqCst),
+    }
 }
 
 // SAFETY: forwards every call unchanged to the system's allocator.
@@ -52,12 +60,14 @@ unsafe impl GlobalAlloc for Counting {
             CALLS.fetch_add(1, SeqCst);
             BYTES.fetch_add(layout.size(), SeqCst);
         }
+        HELD.fetch_add(layout.size() as isize, SeqCst);
         // SAFETY: the caller's layout, unchanged.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         CALLS.fetch_add(usize::from(counted()), SeqCst);
+        HELD.fetch_sub(layout.size() as isize, SeqCst);
         // SAFETY: the pointer came from `alloc` above with this layout.
         unsafe { System.dealloc(pointer, layout) }
     }
