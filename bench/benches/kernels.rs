@@ -8,7 +8,7 @@ use criterion::{Criterion, Throughput};
 use sf_bench::{Layer, Peak, layers};
 use sf_ops::{Ctx, Kernels, par::Pool, peak};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// The median, in seconds, that criterion left for a bench; none when it was filtered out.
 fn median(root: &Path, group: &str, id: &str) -> Option<f64> {
@@ -22,10 +22,49 @@ fn median(root: &Path, group: &str, id: &str) -> Option<f64> {
 }
 
 struct Row {
-    group: String,
-    layer: Layer,
+    kind: &'static str,
+    size: String,
     kernel: &'static str,
-    peak: f64,
+    seconds: f64,
+    ops: f64,
+    bytes: f64,
+    share: Option<f64>,
+}
+
+/// Time of a probe of the peak.
+const PROBE: Duration = Duration::from_millis(8);
+/// Runs between two probes take so long or longer.
+const RUNS: f64 = 8e-3;
+/// Pairs of probe and runs.
+const ROUNDS: usize = 9;
+
+/// Median over rounds of the rate over the peak that the same threads reach right before and after: clocks drift by a quarter within
+/// seconds on shared machines, and a peak probed once would make a figure of that. None for passes over memory.
+fn share(layer: &mut Layer, ctx: Ctx) -> Option<f64> {
+    let probe = || {
+        let threads = ctx.pool.threads();
+        match layer.peak {
+            Peak::F32 => Some(peak::together(threads, || peak::flops_per_second(ctx.kernels, PROBE))),
+            Peak::S8 => Some(peak::together(threads, || peak::s8_ops_per_second(ctx.kernels, PROBE))),
+            Peak::Memory => None,
+        }
+    };
+    let mut shares = Vec::new();
+    let mut before = probe()?;
+    for _ in 0..ROUNDS {
+        let start = Instant::now();
+        let mut runs = 0;
+        while runs == 0 || start.elapsed().as_secs_f64() < RUNS {
+            (layer.run)(ctx);
+            runs += 1;
+        }
+        let rate = f64::from(runs) * layer.ops / start.elapsed().as_secs_f64();
+        let after = probe()?;
+        shares.push(rate / ((before + after) / 2.0));
+        before = after;
+    }
+    shares.sort_by(f64::total_cmp);
+    Some(shares[ROUNDS / 2])
 }
 
 fn main() {
@@ -47,15 +86,9 @@ fn main() {
     let mut rows = Vec::new();
     for kernels in sets {
         let ctx = Ctx { pool: &pool, kernels };
-        for mut layer in layers(ctx) {
+        for make in layers() {
+            let mut layer = make(ctx);
             let group = format!("{} ({})", layer.kind, kernels.isa.name());
-            let time = Duration::from_millis(20);
-            let probe = || match layer.peak {
-                Peak::F32 => peak::together(threads, || peak::flops_per_second(kernels, time)),
-                Peak::S8 => peak::together(threads, || peak::s8_ops_per_second(kernels, time)),
-                Peak::Memory => 0.0,
-            };
-            let before = probe();
             let mut g = criterion.benchmark_group(&group);
             if layer.ops > 0.0 {
                 g.throughput(Throughput::Elements(layer.ops as u64));
@@ -64,34 +97,23 @@ fn main() {
             }
             g.bench_function(&layer.size, |b| b.iter(|| (layer.run)(ctx)));
             g.finish();
-            let peak = before.max(match layer.peak {
-                Peak::F32 => peak::together(threads, || peak::flops_per_second(kernels, time)),
-                Peak::S8 => peak::together(threads, || peak::s8_ops_per_second(kernels, time)),
-                Peak::Memory => 0.0,
-            });
+            let Some(seconds) = median(&root, &group, &layer.size) else { continue };
+            let share = share(&mut layer, ctx);
             let kernel = match layer.peak {
                 Peak::F32 if layer.kind.ends_with("f32") => kernels.gemm_f32.name,
                 Peak::F32 => kernels.gemm_f16.name,
                 Peak::S8 => kernels.product_s8.name,
                 Peak::Memory => kernels.vector.name,
             };
-            rows.push(Row { group, layer, kernel, peak });
+            let Layer { kind, size, ops, bytes, .. } = layer;
+            rows.push(Row { kind, size, kernel, seconds, ops, bytes, share });
         }
     }
     println!("\n| layer | size | kernel | ms | GOP/s | GB/s | of peak |\n|---|---|---|---|---|---|---|");
-    for Row { group, layer, kernel, peak } in rows {
-        let Some(seconds) = median(&root, &group, &layer.size) else { continue };
-        let rate = layer.ops / seconds;
-        let (rate, share) = if layer.ops > 0.0 {
-            (format!("{:.1}", rate * 1e-9), format!("{:.0} %", 100.0 * rate / peak))
-        } else {
-            (String::new(), String::new())
-        };
-        let Layer { kind, size, bytes, .. } = layer;
-        println!(
-            "| {kind} | {size} | {kernel} | {:.3} | {rate} | {:.1} | {share} |",
-            seconds * 1e3,
-            bytes / seconds * 1e-9
-        );
+    for Row { kind, size, kernel, seconds, ops, bytes, share } in rows {
+        let rate = if ops > 0.0 { format!("{:.1}", ops / seconds * 1e-9) } else { String::new() };
+        let share = share.map_or(String::new(), |s| format!("{:.0} %", 100.0 * s));
+        let gigabytes = bytes / seconds * 1e-9;
+        println!("| {kind} | {size} | {kernel} | {:.3} | {rate} | {gigabytes:.1} | {share} |", seconds * 1e3);
     }
 }

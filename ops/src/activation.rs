@@ -2,9 +2,9 @@
 //!
 //! exp: n = round(x / ln 2), r = x - n ln 2 in two fused steps, e^r = 1 + r + r^2 q(r) with q of degree 4, fitted to
 //! 2^-28; scaled by 2^(n-1) * 2 so that n = 128 works. Results below 2^-125 are 0.
-//! gelu: x Phi(x) in the erf form. For u = |x| the tail Phi(-u) = e^(-u^2/2) t Q(t), t = 1 / (1 + 0.3 u), Q of
-//! degree 9 fitted to 2^-28 for u up to 14; then gelu = x - x tail for x > 0 and x tail below. The negative side
-//! keeps its relative accuracy, unlike 0.5 x (1 + erf).
+//! gelu: x Phi(x) in the erf form. With z = x clamped to +-5.4, Phi(x) - 1/2 = z P(z^2 mapped to [-1, 1]), P of degree 15 fitted (weighted
+//! minimax) to 4e-9 of Phi: no exponential and no division, 22 instructions for a register of values where the form e^(-x^2/2) Q(1 / (1 + 0.3 x))
+//! took 50. Below -5.4, where x Phi(x) is above -1.8e-7, the result is 0.
 
 // Coefficients and split constants carry every digit they were fitted with.
 #![allow(clippy::excessive_precision)]
@@ -48,48 +48,56 @@ pub(crate) fn sigmoid_lanes<S: Simd>(s: S, x: S::V) -> S::V {
     one / (one + exp_lanes(s, s.splat(0.0) - x))
 }
 
-/// Phi(-u) for u >= 0: the upper tail of the normal distribution.
+/// Beyond, Phi is 0 or 1 to 3.4e-8.
+const PHI_MAX: f32 = 5.4;
+/// Coefficients of P, highest first.
+const PHI: [f32; 16] = [
+    -1.703_154_85e-4,
+    4.623_555_87e-4,
+    -4.251_080_39e-4,
+    6.496_891_73e-4,
+    -2.038_438_8e-3,
+    3.944_015_13e-3,
+    -6.104_658_36e-3,
+    9.473_515_67e-3,
+    -1.419_679_26e-2,
+    1.970_151_63e-2,
+    -2.570_084_3e-2,
+    3.210_816_53e-2,
+    -3.921_072_19e-2,
+    4.850_005_73e-2,
+    -6.532_795_73e-2,
+    1.309_281_14e-1,
+];
+
+/// P(z) of z in [-5.4, 5.4]: the normal distribution function is 1/2 + z P.
 #[inline(always)]
-fn tail<S: Simd>(s: S, u: S::V) -> S::V {
-    const Q: [f32; 10] = [
-        -0.020_611_741,
-        0.112_369_992,
-        -0.228_054_152,
-        0.191_564_138,
-        -0.079_232_903,
-        0.096_050_138,
-        0.078_428_228,
-        0.110_226_757,
-        0.119_572_909,
-        0.119_686_631,
-    ];
-    let one = s.splat(1.0);
-    let t = one / u.mul_add(s.splat(0.3), one);
-    let mut q = s.splat(Q[0]);
-    for c in &Q[1..] {
-        q = q.mul_add(t, s.splat(*c));
+fn phi<S: Simd>(s: S, z: S::V) -> S::V {
+    let t = (z * z).mul_add(s.splat(2.0 / (PHI_MAX * PHI_MAX)), s.splat(-1.0));
+    let mut p = s.splat(PHI[0]);
+    for c in &PHI[1..] {
+        p = p.mul_add(t, s.splat(*c));
     }
-    exp_lanes(s, (u * u) * s.splat(-0.5)) * (q * t)
+    p
 }
 
-/// x Phi(x).
+/// x Phi(x); NaN stays NaN.
 #[inline(always)]
 pub(crate) fn gelu_lanes<S: Simd>(s: S, x: S::V) -> S::V {
-    let zero = s.splat(0.0);
-    let side = x * tail(s, x.abs());
-    // Minus infinity times a tail of 0 is 0 here, not NaN.
-    let below = s.splat(-15.0).select_gt(x, zero, side);
-    let above = s.splat(15.0).select_gt(x, x - side, x);
-    x.select_gt(zero, above, below)
+    // Minus infinity is cut too: times a Phi of 0 it would be NaN.
+    let x = s.splat(-PHI_MAX).max(x);
+    let z = s.splat(PHI_MAX).min(x);
+    // At the lower end 1/2 + z P is -3e-8.
+    x * s.splat(0.0).max(z.mul_add(phi(s, z), s.splat(0.5)))
 }
 
-/// erf(x) = sign(x) (1 - 2 Phi(-|x| sqrt 2)); about 1e-7 absolute.
+/// erf(x) = 2 (Phi(x sqrt 2) - 1/2); about 1e-7 absolute.
 #[inline(always)]
 fn erf_lanes<S: Simd>(s: S, x: S::V) -> S::V {
-    let zero = s.splat(0.0);
-    let t = tail(s, x.abs() * s.splat(std::f32::consts::SQRT_2));
-    let y = s.splat(1.0) - (t + t);
-    x.select_gt(zero, y, zero.select_gt(x, zero - y, x))
+    let x = x * s.splat(std::f32::consts::SQRT_2);
+    let z = s.splat(PHI_MAX).min(s.splat(-PHI_MAX).max(x));
+    let p = phi(s, z);
+    z * (p + p)
 }
 
 /// x < 0 ? 0 : x, which keeps NaN.
@@ -109,8 +117,8 @@ pub(crate) enum Map {
 
 struct Exp;
 struct Sigmoid;
-struct Gelu;
-struct Relu;
+pub(crate) struct Gelu;
+pub(crate) struct Relu;
 struct Erf;
 
 impl Lanewise for Exp {

@@ -19,7 +19,7 @@ use crate::cpu::Ctx;
 use crate::gemm::pack::{MAX_MR, NR};
 use crate::gemm::s8::pack::{PanelsS8, QUAD, STEP, padded_k};
 use crate::gemm::s8::table::GemmS8Kernel;
-use crate::gemm::s8::tile::{ColumnsS8, FinishS8, MAX_NV, Plus, TileS8};
+use crate::gemm::s8::tile::{Ahead, ColumnsS8, FinishS8, MAX_NV, Plus, TileS8};
 use crate::gemm::s8::{STEPS, starts};
 use crate::gemm::{Act, Sink};
 use crate::mat::{Hwc, HwcMut};
@@ -294,6 +294,11 @@ impl Layer<'_> {
             let w = &weight.data[panel * w_stride..];
             let size = mr * NR * panels;
             let first = rows.start * shape.ow;
+            let near = Ahead::nothing(map);
+            let ahead_of = |step: &Step| match (out, step.done) {
+                (Out::Image { out, .. }, Some(row)) => near.with_outputs(out.at(row * weight.n + panel * NR), weight.n),
+                _ => near,
+            };
             sweep(shape, rows.clone(), mr, STEPS * QUAD / kernel.bytes, |step: Step| {
                 let acc = &mut acc[step.tile * size..][..size];
                 let tile = TileS8 {
@@ -306,6 +311,7 @@ impl Layer<'_> {
                     start: step.start.then_some(&start),
                     acc: &mut *acc,
                     acc_stride: mr * NR,
+                    ahead: ahead_of(&step),
                 };
                 ctx.kernels.windows_s8(tile, step.windows);
                 if let Some(row) = step.done {

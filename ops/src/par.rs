@@ -345,23 +345,10 @@ impl<'a, T> SharedMut<'a, T> {
         Self { data: data.as_mut_ptr(), len: data.len(), owner: PhantomData }
     }
 
-    /// Asks for the cache lines of `rows` pieces of `len` values, `stride` apart from `at`, that will be written soon. A hint:
-    /// nothing is read or written, and nothing happens where the architecture has no such instruction.
+    /// Address of value `at`, also outside: for hints only.
     #[inline]
-    pub(crate) fn prefetch(&self, at: usize, len: usize, stride: usize, rows: usize) {
-        #[cfg(target_arch = "x86_64")]
-        for r in 0..rows {
-            for i in (0..len).step_by((64 / size_of::<T>()).max(1)) {
-                let p = self.data.wrapping_add(at + r * stride + i);
-                // SAFETY: a prefetch has no effect on memory and faults for no address; SSE is part of x86-64.
-                #[allow(unsafe_code)]
-                unsafe {
-                    std::arch::x86_64::_mm_prefetch::<{ std::arch::x86_64::_MM_HINT_T0 }>(p.cast());
-                }
-            }
-        }
-        #[cfg(not(target_arch = "x86_64"))]
-        let _ = (at, len, stride, rows);
+    pub(crate) fn at(&self, at: usize) -> *const T {
+        self.data.wrapping_add(at)
     }
 
     /// The values in `range`.

@@ -6,6 +6,7 @@
 use crate::gemm::s8::pack::QUAD;
 use crate::gemm::s8::table::{Activations, GemmS8Kernel};
 use crate::hadamard::{Rotation, rotate};
+use crate::prefetch::near_l1;
 use crate::quantize::clamp;
 use crate::rope::{RopeTable, turn};
 use crate::simd::{LANES, Simd, Vector, fold_lanes};
@@ -29,6 +30,20 @@ pub(crate) fn padded_bytes(d: usize) -> usize {
 
 /// Rows of a stage, with room for a vector that runs over.
 pub(crate) const STAGE_ROWS: usize = KEYS + LANES;
+
+/// Rows asked for before they are read: heads lie side by side, so a head's rows are whole pages apart and no hardware prefetcher follows
+/// them. From a third-level cache 140 ns away, unasked, they took a third of the time of attention.
+const ROWS_AHEAD: usize = 8;
+
+/// Asks for one row of `d` values, also beyond the end of `x`.
+#[inline(always)]
+fn ask_row(x: &[f32], at: usize, d: usize) {
+    let row = x.as_ptr().wrapping_add(at);
+    for i in (0..d).step_by(LANES) {
+        near_l1(row.wrapping_add(i));
+    }
+    near_l1(row.wrapping_add(d - 1));
+}
 
 /// Most vectors of a head.
 const MAX_N: usize = MAX_D / LANES;
@@ -114,6 +129,7 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
     let mut row = [0.0f32; MAX_D + LANES];
     for r in 0..rows {
         let mut v = [zero; MAX_N];
+        ask_row(x, (r + ROWS_AHEAD) * stride, d);
         let x = &x[r * stride..];
         if let Some(x) = x.as_chunks::<LANES>().0.get(..n) {
             for i in 0..n {
@@ -430,7 +446,10 @@ pub(crate) fn pack_values<S: Simd>(s: S, t: ValuePack) {
         let (scales, sums) = columns[tile * 2 * width..][..2 * width].split_at_mut(width);
         for c in (0..d).step_by(LANES) {
             let x = &x[first * stride + c..];
-            for (to, row) in block.iter_mut().zip(x.chunks(stride)).take(keys) {
+            for (r, (to, row)) in block.iter_mut().zip(x.chunks(stride)).take(keys).enumerate() {
+                if c == 0 {
+                    ask_row(x, (r + ROWS_AHEAD) * stride, d);
+                }
                 match row.first_chunk::<LANES>() {
                     Some(row) => s.load(row).store(to),
                     None => to[..row.len()].copy_from_slice(row),

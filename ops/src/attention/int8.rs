@@ -38,13 +38,14 @@ use crate::cpu::{Ctx, Kernels};
 use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
 use crate::gemm::s8::pack::{QUAD, STEP};
 use crate::gemm::s8::table::Activations;
-use crate::gemm::s8::tile::{ColumnS8, MAX_NV, TileS8};
+use crate::gemm::s8::tile::{Ahead, ColumnS8, MAX_NV, TileS8};
 use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
 use crate::hadamard::Rotation;
 use crate::mat::{Mat, MatMut};
 use crate::opclock::{self, Op};
 use crate::par::SharedMut;
+use crate::prefetch::near_for_writing;
 use crate::rope::{QkNorm, RopeTable};
 use crate::simd::LANES;
 
@@ -291,7 +292,7 @@ impl<'a> Job<'a> {
     fn starts(&self, sums: &[i32; LANES]) -> [i32; LANES] {
         match self.kernels.gemm_s8.activations {
             Activations::Signed => [0; LANES],
-            Activations::Offset128 => sums.map(|v| -128 * v),
+            Activations::Offset128 => sums.map(|v| v.wrapping_mul(-128)),
         }
     }
 
@@ -308,6 +309,7 @@ impl<'a> Job<'a> {
             start: None,
             acc: &mut sums,
             acc_stride: LANES,
+            ahead: Ahead::nothing(panel),
         });
         sums
     }
@@ -363,6 +365,9 @@ impl<'a> Job<'a> {
         let weights: &mut [i8] = bytemuck::cast_slice_mut(weights);
         let sums: &mut [i32] = bytemuck::cast_slice_mut(sums);
         acc.fill(0.0);
+        // The outputs' rows lie pages apart: some are asked for with each tile of keys.
+        let asked = queries.div_ceil(seen.len() * tokens.div_ceil(KEYS));
+        let mut ask = 0..queries;
         for frame in seen.clone() {
             let unit = self.unit(packed, frame, at.head);
             if seen.len() > 1 {
@@ -370,6 +375,11 @@ impl<'a> Job<'a> {
             }
             for first in (0..tokens).step_by(KEYS) {
                 let keys = KEYS.min(tokens - first);
+                for q in ask.by_ref().take(asked) {
+                    for c in (0..d).step_by(LINE) {
+                        near_for_writing(out.at(first_out + q * stride + c));
+                    }
+                }
                 self.scores(&unit, (first, keys), (q, panels), &run.start, scores);
                 if let Some(watch) = self.watch {
                     let place = Place { row: at.frame * tokens + at.first, head: at.head, queries };
@@ -385,9 +395,9 @@ impl<'a> Job<'a> {
                         key_scales: &unit.scales[first..first + keys],
                         query_scales: &run.scales[p],
                         top: &mut tile_top[p],
-                        weights: &mut *weights,
+                        weights,
+                        totals: &mut weight_sums[p],
                     });
-                    weight_sums[p] = self.byte_sums(weights, key_steps);
                 }
                 self.values(&unit, (first, keys), (weights, panels), &weight_sums, sums);
                 let columns = &unit.columns[first / KEYS * 2 * padded_d(d)..][..2 * padded_d(d)];

@@ -75,6 +75,8 @@ pub(crate) struct WeightsS8<'a> {
     pub top: &'a mut [f32; LANES],
     /// `[keys/4][16][4]`: weight - 127; weight 0 behind the last key.
     pub weights: &'a mut [i8],
+    /// Sums of weight - 127, those behind the last key included, `[16]`.
+    pub totals: &'a mut [i32; LANES],
 }
 
 /// t = score * key scale, top = max t, weight = round(254 * 2^((t - top) * query scale * log2 e)), 0 below 2^-20.
@@ -82,13 +84,21 @@ pub(crate) struct WeightsS8<'a> {
 pub(crate) fn weights_tile<S: Simd>(s: S, t: WeightsS8) {
     let n = t.key_scales.len();
     let scores = &mut t.scores.as_chunks_mut::<LANES>().0[..n];
-    // From the first key on, not from minus infinity, so that NaN stays.
-    let mut top = s.load_i32(&scores[0]) * s.splat(t.key_scales[0]);
-    for (score, &scale) in scores.iter_mut().zip(t.key_scales) {
-        let v = s.load_i32(score) * s.splat(scale);
-        top = v.max(top);
-        v.store(bytemuck::cast_mut(score));
+    // From keys on, not from minus infinity, so that NaN stays (a NaN in a key is one in the mean, and so in every key). Four chains: one
+    // waits four cycles for each maximum.
+    let mut tops = [s.splat(0.0); 4];
+    for (i, top) in tops.iter_mut().enumerate() {
+        let i = i.min(n - 1);
+        *top = s.load_i32(&scores[i]) * s.splat(t.key_scales[i]);
     }
+    for (scores, scales) in scores.chunks_mut(4).zip(t.key_scales.chunks(4)) {
+        for ((score, &scale), top) in scores.iter_mut().zip(scales).zip(&mut tops) {
+            let v = s.load_i32(score) * s.splat(scale);
+            *top = v.max(*top);
+            v.store(bytemuck::cast_mut(score));
+        }
+    }
+    let top = tops[0].max(tops[1]).max(tops[2].max(tops[3]));
     top.store(t.top);
     let scale = s.load(t.query_scales) * s.splat(std::f32::consts::LOG2_E);
     let negative = s.splat(0.0) - scale;
@@ -97,6 +107,8 @@ pub(crate) fn weights_tile<S: Simd>(s: S, t: WeightsS8) {
     let shift = s.splat(ROUND + 127.0);
     let none = s.splat(ROUND - WEIGHT_ZERO as f32);
     let quads = t.weights.as_chunks_mut::<{ QUAD * LANES }>().0;
+    // A weight is the number ROUND + (weight - 127): its bits are those of ROUND plus the integer, and so are sums of bits.
+    let mut bits = [s.splat(0.0); 2];
     for (scores, out) in scores.chunks(QUAD).zip(quads) {
         let mut quad = [none; QUAD];
         if let Some(four) = scores.first_chunk::<QUAD>() {
@@ -109,7 +121,14 @@ pub(crate) fn weights_tile<S: Simd>(s: S, t: WeightsS8) {
                 *y = weight(s, s.load(bytemuck::cast_ref(v)), (top, floor), (scale, negative), (shift, none));
             }
         }
+        bits[0] = bits[0].add_bits(quad[0].add_bits(quad[1]));
+        bits[1] = bits[1].add_bits(quad[2].add_bits(quad[3]));
         S::V::store_low_bytes(quad, out);
+    }
+    bits[0].add_bits(bits[1]).store(bytemuck::cast_mut(t.totals));
+    let many = (n.next_multiple_of(QUAD) as u32).wrapping_mul(ROUND.to_bits()) as i32;
+    for total in t.totals.iter_mut() {
+        *total = total.wrapping_sub(many);
     }
 }
 

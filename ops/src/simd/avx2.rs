@@ -194,6 +194,12 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn min(self, o: V) -> V {
+        // SAFETY: the vector proves avx2. minps is exactly a < b ? a : b.
+        unsafe { V(_mm256_min_ps(self.0, o.0), _mm256_min_ps(self.1, o.1)) }
+    }
+
+    #[inline(always)]
     fn select_gt(self, o: V, yes: V, no: V) -> V {
         // SAFETY: the vector proves avx2.
         unsafe {
@@ -235,6 +241,16 @@ impl Vector for V {
             let bias = _mm256_set1_epi32(bias << 23);
             let lo = _mm256_add_epi32(_mm256_slli_epi32::<23>(_mm256_castps_si256(self.0)), bias);
             let hi = _mm256_add_epi32(_mm256_slli_epi32::<23>(_mm256_castps_si256(self.1)), bias);
+            V(_mm256_castsi256_ps(lo), _mm256_castsi256_ps(hi))
+        }
+    }
+
+    #[inline(always)]
+    fn add_bits(self, o: V) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let lo = _mm256_add_epi32(_mm256_castps_si256(self.0), _mm256_castps_si256(o.0));
+            let hi = _mm256_add_epi32(_mm256_castps_si256(self.1), _mm256_castps_si256(o.1));
             V(_mm256_castsi256_ps(lo), _mm256_castsi256_ps(hi))
         }
     }

@@ -144,6 +144,12 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn min(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f. minps is exactly a < b ? a : b.
+        unsafe { V(_mm512_min_ps(self.0, o.0)) }
+    }
+
+    #[inline(always)]
     fn select_gt(self, o: V, yes: V, no: V) -> V {
         // SAFETY: the vector proves avx512f.
         unsafe { V(_mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, o.0), no.0, yes.0)) }
@@ -173,6 +179,15 @@ impl Vector for V {
         unsafe {
             let shifted = _mm512_slli_epi32::<23>(_mm512_castps_si512(self.0));
             V(_mm512_castsi512_ps(_mm512_add_epi32(shifted, _mm512_set1_epi32(bias << 23))))
+        }
+    }
+
+    #[inline(always)]
+    fn add_bits(self, o: V) -> V {
+        // SAFETY: the vector proves avx512f.
+        unsafe {
+            let sum = _mm512_add_epi32(_mm512_castps_si512(self.0), _mm512_castps_si512(o.0));
+            V(_mm512_castsi512_ps(sum))
         }
     }
 

@@ -59,6 +59,8 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn mul_add(self, a: Self, b: Self) -> Self;
     /// self > other ? self : other; a NaN on either side gives `other`.
     fn max(self, other: Self) -> Self;
+    /// self < other ? self : other; a NaN on either side gives `other`.
+    fn min(self, other: Self) -> Self;
     /// Lanes of `yes` where self > other, of `no` elsewhere (also for NaN).
     fn select_gt(self, other: Self, yes: Self, no: Self) -> Self;
     /// Bit i set where lane i of self > other; clear for NaN.
@@ -69,6 +71,8 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn sqrt(self) -> Self;
     /// (bits(self) << 23) + (`bias` << 23) as float: 2^(n + bias - 127) when the low bits of self hold n.
     fn pow2_of_low_bits(self, bias: i32) -> Self;
+    /// Sum of the bits of the lanes as integers, modulo 2^32.
+    fn add_bits(self, other: Self) -> Self;
     /// Flips the sign of lane i where bit i of `lanes` is set; also of zeros.
     fn negate(self, lanes: u16) -> Self;
     /// Lane i takes lane i ^ H, for H = 1, 2, 4, 8.

@@ -172,6 +172,12 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn min(self, o: V) -> V {
+        // Compare and select: fmin has other rules for NaN and zeros.
+        o.select_gt(self, self, o)
+    }
+
+    #[inline(always)]
     fn select_gt(self, o: V, yes: V, no: V) -> V {
         let (a, b, y, n) = (self.0, o.0, yes.0, no.0);
         // SAFETY: the vector proves neon.
@@ -222,6 +228,18 @@ impl Vector for V {
             }
             V(y)
         }
+    }
+
+    #[inline(always)]
+    fn add_bits(self, o: V) -> V {
+        let mut y = self.0;
+        // SAFETY: the vector proves neon.
+        unsafe {
+            for (r, o) in y.iter_mut().zip(o.0) {
+                *r = vreinterpretq_f32_u32(vaddq_u32(vreinterpretq_u32_f32(*r), vreinterpretq_u32_f32(o)));
+            }
+        }
+        V(y)
     }
 
     #[inline(always)]

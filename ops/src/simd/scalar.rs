@@ -100,6 +100,11 @@ impl Vector for Lanes {
     }
 
     #[inline(always)]
+    fn min(self, o: Lanes) -> Lanes {
+        self.zip(o, |a, b| if a < b { a } else { b })
+    }
+
+    #[inline(always)]
     fn select_gt(self, o: Lanes, yes: Lanes, no: Lanes) -> Lanes {
         Lanes(std::array::from_fn(|i| if self.0[i] > o.0[i] { yes.0[i] } else { no.0[i] }))
     }
@@ -122,6 +127,11 @@ impl Vector for Lanes {
     #[inline(always)]
     fn pow2_of_low_bits(self, bias: i32) -> Lanes {
         Lanes(self.0.map(|x| f32::from_bits((x.to_bits() << 23).wrapping_add((bias as u32) << 23))))
+    }
+
+    #[inline(always)]
+    fn add_bits(self, o: Lanes) -> Lanes {
+        self.zip(o, |a, b| f32::from_bits(a.to_bits().wrapping_add(b.to_bits())))
     }
 
     #[inline(always)]
@@ -240,6 +250,11 @@ impl Vector for Lane {
     }
 
     #[inline(always)]
+    fn min(self, o: Lane) -> Lane {
+        if self.0 < o.0 { self } else { o }
+    }
+
+    #[inline(always)]
     fn select_gt(self, o: Lane, yes: Lane, no: Lane) -> Lane {
         if self.0 > o.0 { yes } else { no }
     }
@@ -262,6 +277,11 @@ impl Vector for Lane {
     #[inline(always)]
     fn pow2_of_low_bits(self, bias: i32) -> Lane {
         Lane(f32::from_bits((self.0.to_bits() << 23).wrapping_add((bias as u32) << 23)))
+    }
+
+    #[inline(always)]
+    fn add_bits(self, o: Lane) -> Lane {
+        Lane(f32::from_bits(self.0.to_bits().wrapping_add(o.0.to_bits())))
     }
 
     #[inline(always)]

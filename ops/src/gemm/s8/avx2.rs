@@ -39,6 +39,7 @@ unsafe fn dot8(acc: __m256i, (a, magnitude): (__m256i, __m256i), w: __m256i) -> 
 // Every SAFETY line below: the token proves avx2; array references give the bounds, and the loads and stores are
 // unaligned ones.
 impl Dot8 for Avx2 {
+    const AHEAD: bool = true;
     type Elem = i8;
     type W = [__m256i; 2];
     type A = (__m256i, __m256i);

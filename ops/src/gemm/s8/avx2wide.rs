@@ -33,6 +33,7 @@ impl Avx2Wide {
 // Every SAFETY line below: the token proves avx2; array references and `pass` < 2 give the bounds, and the loads and stores
 // are unaligned ones.
 impl Dot8 for Avx2Wide {
+    const AHEAD: bool = true;
     type Elem = i16;
     /// Four outputs each, four inputs of an output side by side.
     type W = [__m256i; 2];

@@ -25,6 +25,7 @@ impl Avx512Vnni {
 // Every SAFETY line below: the token proves the features; array references give the bounds, and the loads and
 // stores are unaligned ones.
 impl Dot8 for Avx512Vnni {
+    const AHEAD: bool = true;
     type Elem = i8;
     type W = __m512i;
     type A = __m512i;

@@ -25,6 +25,7 @@ impl AvxVnni {
 // Every SAFETY line below: the token proves the features; array references give the bounds, and the loads and
 // stores are unaligned ones.
 impl Dot8 for AvxVnni {
+    const AHEAD: bool = true;
     type Elem = i8;
     type W = [__m256i; 2];
     type A = __m256i;

@@ -37,7 +37,7 @@ use crate::par::SharedMut;
 use crate::quantize::{Before, QuantizeRow};
 use pack::{PanelsS8, QUAD, RowsS8, RowsS8Mut, STEP, padded_k};
 use table::{Activations, GemmS8Kernel};
-use tile::{ColumnsS8, FinishS8, MAX_NV, Plus, QuadPack, TileS8, WidePack};
+use tile::{Ahead, ColumnsS8, FinishS8, MAX_NV, Plus, QuadPack, TileS8, WidePack};
 
 /// Packed activations of one task, in words of four bytes: at most 256 KiB, a quarter of a usual second-level cache, so that the
 /// panels streaming past do not drive them out.
@@ -200,6 +200,7 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
     let size = mr * NR * part.panels;
     let block = STEPS / p.kernel.bytes;
     let quad = QUAD * p.kernel.bytes;
+    let tiles = part.rows.div_ceil(mr);
     let mut s0 = 0;
     loop {
         let here = block.min(steps - s0);
@@ -208,8 +209,16 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
             let rows = mr.min(part.rows - r);
             let width = p.kernel.fit(rows);
             let acc = &mut acc[tile * size..][..size];
+            // The outputs after the last block, and a share of the next panels: those come from beyond the second-level cache.
+            let mut ahead = Ahead::nothing(packed).with_weights(
+                w.as_ptr()
+                    .wrapping_add((part.panels * steps + (s0 * tiles + tile * here) * part.panels / tiles) * STEP),
+                part.panels * STEP / tiles,
+                width * part.panels,
+                here,
+            );
             if last && let Sink::Values { out, stride, first, .. } = &p.sink {
-                out.prefetch((part.first + r - first) * stride + part.panel * NR, part.panels * NR, *stride, rows);
+                ahead = ahead.with_outputs(out.at((part.first + r - first) * stride + part.panel * NR), *stride);
             }
             let one = TileS8 {
                 rows: width,
@@ -221,6 +230,7 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
                 start: if s0 == 0 { Some(&start) } else { None },
                 acc: &mut *acc,
                 acc_stride: mr * NR,
+                ahead,
             };
             ctx.kernels.product_tile_s8(p.few, one);
             if last {

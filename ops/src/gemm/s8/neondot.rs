@@ -145,6 +145,17 @@ impl Dot8 for NeonDot {
             }
         }
     }
+
+    /// Rows apart are brought together: one load then serves four.
+    #[inline(always)]
+    fn step_apart<const MR: usize, const NV: usize>(
+        self,
+        acc: &mut [[Self::Acc; NV]; MR],
+        rows: &[&[i8; QUAD]; MR],
+        w: &[Self::W; NV],
+    ) {
+        self.step(acc, &rows.map(|r| *r), w);
+    }
 }
 
 super::tile::gemm_s8_entries!(NeonDot, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "neon,dotprod");

@@ -5,12 +5,13 @@
 //! instantiates it. Sums are exact, so neither the order nor the blocking can show.
 
 use super::pack::{PanelsS8, QUAD, STEP};
-use crate::activation::{gelu_lanes, relu_lanes};
+use crate::activation::{Gelu, Relu, gelu_lanes, relu_lanes};
 use crate::gemm::Act;
 use crate::gemm::pack::MAX_MR;
 use crate::gemm::tile::Windows;
 use crate::par::SharedMut;
-use crate::simd::{LANES, Simd, Vector};
+use crate::prefetch::{near_for_writing, near_l1, near_l2};
+use crate::simd::{LANES, Lanewise, Simd, Vector};
 
 /// Panels of the widest kernel.
 pub(crate) const MAX_NV: usize = 2;
@@ -44,6 +45,8 @@ pub(crate) trait Dot8: Copy {
     fn prep_a(self, quad: &[Self::Elem; QUAD]) -> Self::A;
     /// acc + the four products of each output.
     fn dot(self, acc: Self::Acc, a: Self::A, w: Self::W) -> Self::Acc;
+    /// Whether the tile asks for memory ahead of its use; pays where dot products outrun the caches.
+    const AHEAD: bool = false;
     /// One step of the whole tile. An instruction set that takes several rows from one register has its own.
     #[inline(always)]
     fn step<const MR: usize, const NV: usize>(
@@ -58,6 +61,108 @@ pub(crate) trait Dot8: Copy {
                 acc[r][v] = self.dot(acc[r][v], a, w[v]);
             }
         }
+    }
+    /// The same with rows apart in memory. Each is loaded where it is used: sixteen broadcasts loaded first push sums out of registers.
+    #[inline(always)]
+    fn step_apart<const MR: usize, const NV: usize>(
+        self,
+        acc: &mut [[Self::Acc; NV]; MR],
+        rows: &[&[Self::Elem; QUAD]; MR],
+        w: &[Self::W; NV],
+    ) {
+        for r in 0..MR {
+            let a = self.prep_a(rows[r]);
+            for v in 0..NV {
+                acc[r][v] = self.dot(acc[r][v], a, w[v]);
+            }
+        }
+    }
+}
+
+/// Memory that a tile asks for while it multiplies. Hints: no effect on results, any address is safe.
+#[derive(Clone, Copy)]
+pub(crate) struct Ahead {
+    /// First output of the tile.
+    out: *const u8,
+    /// Bytes from one row of outputs to the next.
+    stride: usize,
+    /// Weights that are read after these.
+    next: *const u8,
+    /// Bytes of them for each step.
+    per_step: usize,
+    /// Cache lines of them to ask for at a time.
+    next_lines: usize,
+    /// Whether there is anything to ask for.
+    any: bool,
+}
+
+/// Most cache lines of the next weights to ask for at a time.
+const NEXT_LINES: usize = 4;
+/// Steps between asking for operands and their use: some 100 cycles, more than the second-level cache takes.
+const EARLY: usize = 8;
+
+impl Ahead {
+    /// Nothing: points at operands that are near anyway.
+    pub(crate) fn nothing<T>(near: &[T]) -> Ahead {
+        Ahead {
+            out: near.as_ptr().cast(),
+            stride: 0,
+            next: near.as_ptr().cast(),
+            per_step: 0,
+            next_lines: 0,
+            any: false,
+        }
+    }
+
+    /// With the outputs from `first` on, rows `stride` values apart.
+    pub(crate) fn with_outputs(self, first: *const f32, stride: usize) -> Ahead {
+        Ahead { out: first.cast(), stride: stride * size_of::<f32>(), any: true, ..self }
+    }
+
+    /// With the weights `next` that come after these, `per_step` bytes for each of `steps` steps of a tile of `lines` lines of outputs.
+    pub(crate) fn with_weights(self, next: *const i8, per_step: usize, lines: usize, steps: usize) -> Ahead {
+        let next_lines = (per_step * (steps / lines).max(1)).div_ceil(64).min(NEXT_LINES);
+        Ahead { next: next.cast(), per_step, next_lines, any: true, ..self }
+    }
+
+    /// For a loop of `steps` steps of a tile of `rows` x `NV` panels.
+    #[inline(always)]
+    fn over<const NV: usize>(self, rows: usize, steps: usize) -> Asking<NV> {
+        let each = (steps / (rows * NV)).max(1);
+        Asking { ahead: self, each, step: each * self.per_step, line: 0, lines: rows * NV, steps }
+    }
+}
+
+/// Asks for a line of outputs and a share of the next weights now and then.
+struct Asking<const NV: usize> {
+    ahead: Ahead,
+    /// Steps between two lines.
+    each: usize,
+    /// Bytes of the next weights in so many.
+    step: usize,
+    line: usize,
+    lines: usize,
+    steps: usize,
+}
+
+impl<const NV: usize> Asking<NV> {
+    /// Steps until the next line; those left if `ask` is false or no line is left.
+    #[inline(always)]
+    fn next(&mut self, ask: bool, done: usize) -> usize {
+        let left = self.steps - done;
+        if !ask || !self.ahead.any || self.line == self.lines {
+            return left;
+        }
+        near_for_writing(self.ahead.out.wrapping_add(self.line % NV * (LANES * size_of::<f32>())));
+        self.line += 1;
+        if self.line.is_multiple_of(NV) {
+            self.ahead.out = self.ahead.out.wrapping_add(self.ahead.stride);
+        }
+        for i in 0..self.ahead.next_lines {
+            near_l2(self.ahead.next.wrapping_add(i * 64));
+        }
+        self.ahead.next = self.ahead.next.wrapping_add(self.step);
+        self.each.min(left)
     }
 }
 
@@ -81,6 +186,8 @@ pub(crate) struct TileS8<'a> {
     pub acc: &'a mut [i32],
     /// Values from one panel's sums to the next.
     pub acc_stride: usize,
+    /// What is asked for meanwhile.
+    pub ahead: Ahead,
 }
 
 /// Tiles below one another: one call for all packed rows that share some panels.
@@ -120,6 +227,7 @@ impl ColumnS8<'_> {
             start: Some(self.start),
             acc: &mut self.acc[first * LANES..],
             acc_stride: self.acc_stride,
+            ahead: Ahead::nothing(self.a),
         }
     }
 }
@@ -160,12 +268,29 @@ pub(crate) fn packed<D: Dot8, const MR: usize, const NV: usize>(d: D, mut t: Til
         for v in 0..NV {
             panels[v] = &t.w[v * t.w_stride..].as_chunks::<STEP>().0[..steps];
         }
-        for i in 0..steps {
-            let mut w = [d.load_w(pass, &panels[0][i]); NV];
-            for v in 1..NV {
-                w[v] = d.load_w(pass, &panels[v][i]);
+        let mut asking = t.ahead.over::<NV>(MR, steps);
+        let mut done = 0;
+        while done < steps {
+            let here = asking.next(D::AHEAD, done);
+            let a = &a[done..][..here];
+            let mut now: [&[[i8; STEP]]; NV] = [&[]; NV];
+            for v in 0..NV {
+                now[v] = &panels[v][done..][..here];
             }
-            d.step(&mut acc, &a[i], &w);
+            for i in 0..here {
+                if D::AHEAD {
+                    near_l1(a.as_ptr().wrapping_add(i + EARLY));
+                    for v in 0..NV {
+                        near_l1(now[v].as_ptr().wrapping_add(i + EARLY));
+                    }
+                }
+                let mut w = [d.load_w(pass, &now[0][i]); NV];
+                for v in 1..NV {
+                    w[v] = d.load_w(pass, &now[v][i]);
+                }
+                d.step(&mut acc, &a[i], &w);
+            }
+            done += here;
         }
         end(d, pass, &acc, &mut t);
     }
@@ -188,16 +313,28 @@ pub(crate) fn windows<D: Dot8, const MR: usize, const NV: usize>(d: D, mut t: Ti
             for v in 0..NV {
                 panels[v] = &t.w[v * t.w_stride + l * run * STEP..].as_chunks::<STEP>().0[..run];
             }
-            for i in 0..run {
-                let mut w = [d.load_w(pass, &panels[0][i]); NV];
-                for v in 1..NV {
-                    w[v] = d.load_w(pass, &panels[v][i]);
+            // The outputs while the last line runs.
+            let mut asking = t.ahead.over::<NV>(MR, run);
+            let mut done = 0;
+            while done < run {
+                let here = asking.next(D::AHEAD && l + 1 == lines, done);
+                for i in done..done + here {
+                    if D::AHEAD {
+                        for v in 0..NV {
+                            near_l1(panels[v].as_ptr().wrapping_add(i + EARLY));
+                        }
+                    }
+                    let mut w = [d.load_w(pass, &panels[0][i]); NV];
+                    for v in 1..NV {
+                        w[v] = d.load_w(pass, &panels[v][i]);
+                    }
+                    let mut quads = [&rows[0][i]; MR];
+                    for r in 1..MR {
+                        quads[r] = &rows[r][i];
+                    }
+                    d.step_apart(&mut acc, &quads, &w);
                 }
-                let mut quads = [rows[0][i]; MR];
-                for r in 1..MR {
-                    quads[r] = rows[r][i];
-                }
-                d.step(&mut acc, &quads, &w);
+                done += here;
             }
         }
         end(d, pass, &acc, &mut t);
@@ -385,6 +522,9 @@ impl Quad for [i16; QUAD] {
     }
 }
 
+/// Bytes of a row asked for before they are packed.
+const ROW_AHEAD: usize = 4 * LANES * QUAD;
+
 /// Rows to quads in blocks of 16 x 16, transposed in registers (a quad moves like the bits of one f32).
 #[inline(always)]
 fn transposed<S: Simd, Q: Quad>(
@@ -404,8 +544,16 @@ fn transposed<S: Simd, Q: Quad>(
                 continue;
             }
             let row = &from[r][q0 * QUAD..(q0 + len) * QUAD];
-            for (b, quad) in block[r].iter_mut().zip(row.as_chunks::<QUAD>().0) {
-                *b = f32::from_bits(u32::from_ne_bytes(quad.map(|v| v as u8)));
+            // Rows are far apart: more streams than the hardware follows.
+            near_l1(row.as_ptr().wrapping_add(ROW_AHEAD));
+            // Sixteen at once as one copy of known size: of unknown size it is a call of the C library.
+            match row.first_chunk::<{ LANES * QUAD }>() {
+                Some(row) => block[r] = bytemuck::cast(*row),
+                None => {
+                    for (b, quad) in block[r].iter_mut().zip(row.as_chunks::<QUAD>().0) {
+                        *b = f32::from_bits(u32::from_ne_bytes(quad.map(|v| v as u8)));
+                    }
+                }
             }
         }
         s.transpose(&mut block);
@@ -508,6 +656,57 @@ impl ColumnsS8 {
 /// y = act(fma(acc, row scale * output scale, bias)) * gamma; out = out + y or y. Every step rounds once.
 #[inline(always)]
 pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
+    let whole = t.cols == t.panels * LANES && !t.gamma && !t.relu_sum && matches!(t.plus, Plus::Nothing);
+    // Most tiles: nothing to decide for each vector.
+    match (whole, t.panels, t.act) {
+        (true, 2, Act::None) => finish_whole::<S, Same, 2>(s, &t),
+        (true, 2, Act::Gelu) => finish_whole::<S, Gelu, 2>(s, &t),
+        (true, 2, Act::Relu) => finish_whole::<S, Relu, 2>(s, &t),
+        (true, 1, Act::None) => finish_whole::<S, Same, 1>(s, &t),
+        (true, 1, Act::Gelu) => finish_whole::<S, Gelu, 1>(s, &t),
+        (true, 1, Act::Relu) => finish_whole::<S, Relu, 1>(s, &t),
+        _ => finish_any(s, &t),
+    }
+}
+
+/// No activation.
+struct Same;
+
+impl Lanewise for Same {
+    #[inline(always)]
+    fn apply<S: Simd>(_: S, x: S::V) -> S::V {
+        x
+    }
+}
+
+/// Whole panels, activation `F`, nothing added.
+#[inline(always)]
+fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &FinishS8) {
+    let rows = t.row_scales.len();
+    let mut acc: [&[[i32; LANES]]; NV] = [&[]; NV];
+    let mut scale = [s.splat(0.0); NV];
+    let mut bias = [s.splat(0.0); NV];
+    for v in 0..NV {
+        acc[v] = &t.acc[v * t.acc_stride..].as_chunks::<LANES>().0[..rows];
+        scale[v] = s.load(&t.columns.scales[v]);
+        bias[v] = s.load(&t.columns.bias[v]);
+    }
+    for r in 0..rows {
+        let at = t.at + r * t.stride;
+        // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
+        #[allow(unsafe_code)]
+        let out = unsafe { t.out.slice(at..at + NV * LANES) };
+        let out = &mut out.as_chunks_mut::<LANES>().0[..NV];
+        let row = s.splat(t.row_scales[r]);
+        for v in 0..NV {
+            F::apply(s, s.load_i32(&acc[v][r]).mul_add(row * scale[v], bias[v])).store(&mut out[v]);
+        }
+    }
+}
+
+/// Any tile.
+#[inline(always)]
+fn finish_any<S: Simd>(s: S, t: &FinishS8) {
     let rows = t.row_scales.len();
     for p in 0..t.panels {
         let acc = &t.acc[p * t.acc_stride..][..rows * LANES].as_chunks::<LANES>().0[..rows];
