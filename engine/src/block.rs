@@ -150,6 +150,9 @@ fn attend(net: Net, block: &Block, qkv: &[f32], sight: Sight, to: Attend) {
 /// x += ls2 * fc2(gelu(fc1(norm2 x))).
 fn mlp(net: Net, block: &Block, x: &mut [f32], rows: usize, normed: &mut [f32], wide: &mut [f32]) {
     let (dim, hidden) = (block.dim, block.hidden);
+    if net.pair_onto(&block.norm2, (&block.fc1, Act::Gelu), (&block.fc2, block.ls2), x) {
+        return;
+    }
     let wide = &mut wide[..rows * hidden];
     let from = (Mat::new(x, rows, dim), normed);
     net.normed_linear(&block.norm2, &block.fc1, Act::Gelu, from, MatMut::new(wide, rows, hidden));

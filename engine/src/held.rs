@@ -5,6 +5,7 @@
 use crate::dims::Dims;
 use crate::heads::dpt;
 use crate::model::{Block, Decoder, DenseHead, Dpt, Guided, Linear, Model};
+use crate::net;
 use crate::tables::{Tokens, causal_tokens};
 use sf_ops::{conv, conv_s8, gemm};
 
@@ -48,6 +49,9 @@ impl Most {
     fn blocks(&mut self, blocks: &[Block]) {
         for b in blocks {
             self.linears([&b.qkv, &b.proj, &b.fc1, &b.fc2]);
+            if net::is_pair(&b.fc1.weight, &b.fc2.weight) {
+                self.take(gemm::working_memory_s8_quantize(b.dim, b.hidden));
+            }
             // Query and key norms and the rotary embedding of a row, where attention does not do them.
             let head = (b.dim / b.heads).next_multiple_of(16);
             self.take(2 * b.heads * head + 16);

@@ -10,7 +10,7 @@ use sf_formats::Result;
 use sf_ops::conv::{self, Conv, ConvTranspose};
 use sf_ops::conv_s8::{self, ConvS8, ConvTransposeS8};
 use sf_ops::cpu::Ctx;
-use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, padded_k};
+use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, gemm_s8_quantize, padded_k};
 use sf_ops::hadamard::Rotation;
 use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
 use sf_ops::quantize::{self, Before, quantize};
@@ -35,6 +35,26 @@ impl Rows {
     pub(crate) fn len(weight: &PanelRef, m: usize) -> usize {
         if weight.is_int8() { crate::arena::carved_len(rows_len(m, weight.k)) } else { 0 }
     }
+
+    /// Values that two layers on `m` rows need, the first of which writes the quantized input of the second.
+    pub(crate) fn len_of_pair(first: &PanelRef, second: &PanelRef, m: usize) -> usize {
+        if is_pair(first, second) { crate::arena::carved_len(pair_len(m, first.k, second.k)) } else { 0 }
+    }
+}
+
+/// Inputs and outputs of [`Rows`] for a pair of layers.
+fn pair_len(m: usize, k: usize, n: usize) -> [usize; 4] {
+    let ([a, b], [c, d]) = (rows_len(m, k), rows_len(m, n));
+    [a, b, c, d]
+}
+
+/// Most outputs of the first of two layers that run as a pair: its weights are read once for every block of rows, and beyond this they
+/// leave the caches in between.
+const PAIR: usize = 2048;
+
+/// Whether the outputs of one layer may be quantized for the next while they are in the cache.
+pub(crate) fn is_pair(first: &PanelRef, second: &PanelRef) -> bool {
+    first.is_int8() && second.is_int8() && first.n <= PAIR
 }
 
 /// Who looks at the input rows of linear layers, by the number of the weight's tensor.
@@ -141,6 +161,46 @@ impl Net<'_> {
         }
     }
 
+    /// x += gamma * second(act(first(norm(x)))); the values between the layers are quantized while they are in the cache and never
+    /// written. False, with nothing done, where the layers are no pair ([`is_pair`]) or somebody wants to see what they read.
+    pub(crate) fn pair_onto(
+        &self,
+        norm: &Norm,
+        (first, act): (&Linear, Act),
+        (second, gamma): (&Linear, Option<VecRef>),
+        x: &mut [f32],
+    ) -> bool {
+        let (Weight::Int8(w1, r1), Weight::Int8(w2, r2)) =
+            (self.model.weight(&first.weight), self.model.weight(&second.weight))
+        else {
+            return false;
+        };
+        if !is_pair(&first.weight, &second.weight) || self.seen.is_some() {
+            return false;
+        }
+        let (k, n) = (first.weight.k, first.weight.n);
+        let m = x.len() / k;
+        let mut area = self.rows.0.borrow_mut();
+        let [read, read_scales, made, made_scales] = crate::arena::carve(area.all(), pair_len(m, k, n));
+        let (read, made): (&mut [i8], &mut [i8]) = (bytemuck::cast_slice_mut(read), bytemuck::cast_slice_mut(made));
+        let before = Before { norm: Some(self.quantized_norm(norm)), rotation: r1 };
+        quantize(self.ctx, Mat::new(x, m, k), before, RowsS8Mut { m, k, data: read, scales: read_scales });
+        let bias = |l: &Linear| l.bias.map(|b| self.model.values(b));
+        let ep = Epilogue { bias: bias(first), act, ..Epilogue::default() };
+        let rows = RowsS8 { m, k, data: read, scales: read_scales };
+        let before = Before { norm: None, rotation: r2 };
+        gemm_s8_quantize(self.ctx, rows, w1, ep, before, RowsS8Mut { m, k: n, data: made, scales: made_scales });
+        let gamma = gamma.map(|g| self.model.values(g));
+        let ep = Epilogue { bias: bias(second), gamma, residual: true, ..Epilogue::default() };
+        gemm_s8(self.ctx, RowsS8 { m, k: n, data: made, scales: made_scales }, w2, ep, MatMut::new(x, m, k));
+        true
+    }
+
+    fn quantized_norm(&self, n: &Norm) -> quantize::Norm<'_> {
+        let affine = (!n.plain).then(|| (self.model.values(n.gain), self.model.values(n.offset)));
+        quantize::Norm { affine, eps: n.eps }
+    }
+
     fn int8(
         &self,
         (w, rotation): (PanelsS8, Option<Rotation>),
@@ -149,10 +209,7 @@ impl Net<'_> {
         ep: Epilogue,
         out: MatMut,
     ) {
-        let norm = norm.map(|n| {
-            let affine = (!n.plain).then(|| (self.model.values(n.gain), self.model.values(n.offset)));
-            quantize::Norm { affine, eps: n.eps }
-        });
+        let norm = norm.map(|n| self.quantized_norm(n));
         let mut area = self.rows.0.borrow_mut();
         let [bytes, scales] = crate::arena::carve(area.all(), rows_len(x.rows, x.cols));
         let bytes: &mut [i8] = bytemuck::cast_slice_mut(bytes);

@@ -229,7 +229,8 @@ fn rows(model: &Model, d: &Dims) -> usize {
     let (w, config) = (model.weights(), model.config());
     let blocks = |blocks: &[Block], m: usize| -> usize {
         let layers = blocks.iter().flat_map(|b| [&b.qkv, &b.proj, &b.fc1, &b.fc2]);
-        layers.map(|l| Rows::len(&l.weight, m)).max().unwrap_or(0)
+        let pairs = blocks.iter().map(|b| Rows::len_of_pair(&b.fc1.weight, &b.fc2.weight, m));
+        layers.map(|l| Rows::len(&l.weight, m)).chain(pairs).max().unwrap_or(0)
     };
     let decoder = |x: &Decoder, m: usize| {
         blocks(&x.blocks, m).max(Rows::len(&x.projects.weight, m)).max(Rows::len(&x.linear_out.weight, m))
