@@ -125,6 +125,34 @@ fn eval_draws_held_out_streets_and_writes_its_table() {
 }
 
 #[test]
+fn a_real_drive_is_measured_by_the_frames_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = dir.path().join("tiny.sfw");
+    fs::write(&model, tiny_blob()).unwrap();
+    let drive = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/drive");
+    let args = ["eval", "-m", s(&model), "--data", drive, "--size", "112x56"];
+    let json = ok_json(&[&args[..], &["--fps", "12.5"]].concat());
+    assert_eq!((json["interpolation_frames"].as_u64(), json["extrapolation_frames"].as_u64()), (Some(12), Some(3)));
+    let copy = &json["baselines"]["copy_nearest"];
+    for of in [&json, copy, &json["ablations"]["no_motion"]] {
+        for part in ["interpolation", "extrapolation"] {
+            assert!(of[part]["psnr_full_db"].is_number() && of[part]["ssim_full"].is_number(), "{part}: {of}");
+        }
+    }
+    // Nothing else is known of it.
+    for key in ["psnr_dynamic_db", "depth_rmse_full", "velocity_epe", "rotation_deg", "dynamic_iou", "sky_iou"] {
+        assert!(json[key].is_null(), "{key}: {}", json[key]);
+    }
+    assert_eq!(json["bounds"], serde_json::json!({}));
+    // The network is told the frame rate; what is copied does not depend on it.
+    let other = ok_json(&args);
+    assert_eq!(other["baselines"]["copy_nearest"], *copy);
+    assert_ne!(other["psnr_full_db"], json["psnr_full_db"]);
+    fails(2, &["eval", "-m", s(&model), "--data", drive, "--fps", "0"]);
+    fails(2, &["eval", "-m", s(&model), "--synth-heldout", "1", "--fps", "5"]);
+}
+
+#[test]
 fn the_demo_runs_in_any_folder() {
     let dir = tempfile::tempdir().unwrap();
     let model = dir.path().join("tiny.sfw");

@@ -1,6 +1,7 @@
 //! `eval`: a model against clips with ground truth, beside the trivial alternatives and what true geometry gives.
 //!
-//! Clips come from folders, or are drawn in memory from held-out seeds at the network's size. Rows of the table:
+//! Clips come from folders, or are drawn in memory from held-out seeds at the network's size. A clip without ground truth
+//! has its frames between the given ones drawn and compared all the same; rows that need truth are absent. Rows of the table:
 //!
 //! ```text
 //! model               the network's scene
@@ -42,9 +43,13 @@ pub(crate) struct Args {
     /// inside the binary
     #[arg(short, long, value_name = "MODEL")]
     model: Option<PathBuf>,
-    /// Clips with ground truth, as synth writes them
-    #[arg(long, value_name = "DIR", required_unless_present = "synth_heldout", num_args = 1..)]
+    /// Clips with ground truth, as synth writes them; of any other clip of three frames or more (a real drive) only
+    /// the pictures of the frames left out are compared
+    #[arg(long, value_name = "CLIP", required_unless_present = "synth_heldout", num_args = 1..)]
     data: Vec<PathBuf>,
+    /// Pictures per second, where a clip of --data has no times of its own; default 10
+    #[arg(long, value_name = "FPS", conflicts_with = "synth_heldout")]
+    fps: Option<f64>,
     /// Draw this many streets of seeds that no model is trained on, 20 frames at 10 Hz
     #[arg(long, value_name = "N", conflicts_with = "data", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     synth_heldout: Option<u32>,
@@ -106,7 +111,7 @@ pub(crate) fn run(args: &Args, console: &Console) -> Result<()> {
     let count = args.data.len() as u64 + args.synth_heldout.map_or(0, u64::from);
     let progress = console.progress(count, "eval");
     for path in &args.data {
-        let clip = Clip::open(path, &ClipOptions::default())?;
+        let clip = Clip::open(path, &ClipOptions { fps: args.fps, ..ClipOptions::default() })?;
         let truth = GroundTruth::load(&clip.folder, &clip.indices)?;
         bench.judge(json!({ "path": path_json(path) }), &clip, truth.as_ref())?;
         progress.step();
