@@ -118,12 +118,15 @@ class Sampler:
     def draw(self, s):
         """Number of the clip and the generator of its augmentation."""
         rng = np.random.Generator(np.random.PCG64([self.seed, s]))
-        first = self.offset + int(s / self.reuse)
-        return first + int(rng.integers(self.window)), rng
+        return self.first(s) + int(rng.integers(self.window)), rng
+
+    def first(self, s):
+        """Smallest number that sample s may draw."""
+        return self.offset + int(s / self.reuse)
 
     def last(self, s):
         """Largest number that sample s may draw."""
-        return self.offset + int(s / self.reuse) + self.window - 1
+        return self.first(s) + self.window - 1
 
 
 @dataclass
@@ -202,7 +205,8 @@ class Loader:
             s += self.batch
 
     def make_ahead(self, start):
-        made = self.sampler.last(start)  # earlier ones are made where they are read
+        # From the window's first clip on: another rank may wait for a chunk that this one does not draw from, and this one for it.
+        made = self.sampler.first(start) // self.chunks.count * self.chunks.count
         while True:
             if made <= self.sampler.last(self.front) + self.chunks.count:
                 self.chunks.make(made // self.chunks.count)
