@@ -105,18 +105,28 @@ def gaussians_at(scene, time, config, own=True, without=None, stage_one=False):
 
     `without` leaves out a frame's static Gaussians too, `stage_one` is the paper's schedule before motion: no dynamic
     Gaussian travels, those of the frame at `time` stand where they are.
+
+    `render.split` "hard" makes each Gaussian static or dynamic; "soft" makes it both, its opacity shared by probability, which
+    then learns from the image.
     """
-    moving = scene.dynamic > config["motion.tau"]
-    still = ~moving
+    if config["render.split"] == "soft":
+        moving, still = scene.dynamic > 0, scene.dynamic < 1
+        share = scene.dynamic, 1 - scene.dynamic
+    else:
+        moving = scene.dynamic > config["motion.tau"]
+        still = ~moving
+        share = torch.ones_like(scene.dynamic), torch.ones_like(scene.dynamic)
     if without is not None:
         still = still.clone()
         still[without] = False
     parts = [{name: getattr(scene, name)[still] for name in FIELDS}]
+    parts[0]["opacity"] = parts[0]["opacity"] * share[1][still]
     for frame, ahead, behind in sources(scene.times, time, own or stage_one):
         if frame == without or (stage_one and (ahead or behind)):
             continue
         chosen = moving[frame]
         part = {name: getattr(scene, name)[frame][chosen] for name in FIELDS}
+        part["opacity"] = part["opacity"] * share[0][frame][chosen]
         shift = ahead * scene.v_fwd[frame][chosen] + behind * scene.v_bwd[frame][chosen]
         parts.append(part | {"mean": part["mean"] + shift})
     return {name: torch.cat([part[name] for part in parts]) for name in FIELDS}

@@ -14,7 +14,7 @@ from streetforward import probe, train
 from streetforward.batched import Raw, Wanted, forward_clips
 from streetforward.calibrate import calibrate_camera
 from streetforward.compose import Scene, camera_at, far_shell, gaussians_at, pose_between, sources
-from streetforward.data import Batch, Chunks, Sampler, collate, read_clip
+from streetforward.data import Batch, Chunks, Loader, Sampler, collate, read_clip
 from streetforward.evaluate import Sums, measure
 from streetforward.finetune import Schedule, Thaw
 from streetforward.folders import read_folder
@@ -174,6 +174,23 @@ def test_sampler_draws_each_clip_about_reuse_times_and_never_returns():
     counts = np.bincount(numbers)[64:-64]
     assert 2.7 < counts.mean() < 3.3
     assert all(s // 3 <= n < s // 3 + 64 for s, n in enumerate(numbers))
+
+
+def test_no_rank_waits_for_a_chunk_that_only_it_draws_from(tmp_path, generator):
+    """Rank 0 makes all chunks and stops reading while rank 1's gradients are missing."""
+
+    class Apart(Sampler):
+        def draw(self, s):
+            number, rng = super().draw(s)
+            return number % 2 + 4 * (s % 2), rng  # rank 0 from chunk 0, rank 1 from chunk 2
+
+    def loader(rank):
+        chunks = Chunks(generator, tmp_path / "cache", "train", 42, 28, count=2)
+        return Loader(chunks, Apart(5, window=8, reuse=100), 2, 0, rank, 2, ahead=1)
+
+    ranks = [loader(0), loader(1)]
+    ranks[0].queue.get(timeout=120)
+    assert ranks[1].queue.get(timeout=120).images.shape[:2] == (1, 4)
 
 
 def test_mirrored_clips_are_mirrored_streets():
@@ -364,6 +381,21 @@ def test_composition_is_the_engines():
     assert xs(1.0, without=1) == [300, 500]
     assert xs(1.0, own=False, stage_one=True) == [*static, 100]
     assert sources(scene.times, 0.25, True) == [(0, 0.25, 0.0), (1, 0.0, 0.75)]
+
+
+def test_a_soft_split_shares_opacity_and_teaches_the_mask():
+    scene, config = little_scene(), {**cfg.nano(), "render.split": "soft"}
+    scene.dynamic = torch.tensor([0.9, 0.1]).repeat(3, 1, 1).requires_grad_()
+    fields = gaussians_at(scene, 1.0, config)
+    # All six as static, then frame 1's two as moving ones.
+    assert fields["mean"][:, 0].tolist() == [0, 300, 100, 400, 200, 500, 100, 400]
+    share = [0.1, 0.9, 0.1, 0.9, 0.1, 0.9, 0.9, 0.1]
+    assert torch.allclose(fields["opacity"], 0.8 * torch.tensor(share))
+    fields["opacity"][-2:].sum().backward()
+    assert scene.dynamic.grad[1].flatten().tolist() == pytest.approx([0.8, 0.8])
+    assert scene.dynamic.grad[[0, 2]].abs().sum() == 0
+    hard = gaussians_at(scene, 1.0, cfg.nano())["opacity"]
+    assert torch.equal(hard, torch.full((4,), 0.8))
 
 
 def test_cameras_between_frames():
