@@ -38,14 +38,14 @@ const RUNS: f64 = 8e-3;
 /// Pairs of probe and runs.
 const ROUNDS: usize = 9;
 
-/// Median over rounds of the rate over the peak that the same threads reach right before and after: clocks drift by a quarter within
-/// seconds on shared machines, and a peak probed once would make a figure of that. None for passes over memory.
+/// Median over rounds of the rate over the peak that the same threads reach right before and after, both as means over some milliseconds:
+/// clocks and what neighbours leave drift by a quarter within seconds on shared machines. None for passes over memory.
 fn share(layer: &mut Layer, ctx: Ctx) -> Option<f64> {
     let probe = || {
         let threads = ctx.pool.threads();
         match layer.peak {
-            Peak::F32 => Some(peak::together(threads, || peak::flops_per_second(ctx.kernels, PROBE))),
-            Peak::S8 => Some(peak::together(threads, || peak::s8_ops_per_second(ctx.kernels, PROBE))),
+            Peak::F32 => Some(peak::together(threads, || peak::flops(ctx.kernels, PROBE).mean)),
+            Peak::S8 => Some(peak::together(threads, || peak::s8_ops(ctx.kernels, PROBE).mean)),
             Peak::Memory => None,
         }
     };
@@ -79,9 +79,9 @@ fn main() {
     };
     let mut criterion = Criterion::default()
         .output_directory(&root)
-        .sample_size(20)
-        .warm_up_time(Duration::from_millis(200))
-        .measurement_time(Duration::from_millis(800))
+        .sample_size(15)
+        .warm_up_time(Duration::from_millis(100))
+        .measurement_time(Duration::from_millis(500))
         .configure_from_args();
     let mut rows = Vec::new();
     for kernels in sets {

@@ -120,6 +120,7 @@ def block(frames, tokens, sight, threads, work):
         loaded("ONNX Runtime", "int8", "dynamic", "onnx8", runtime="onnxruntime", model=small),
         loaded("OpenVINO", "f32", "", "ov", runtime="openvino", model=ov),
         loaded("OpenVINO", "int8", "NNCF, static", "ov8", runtime="openvino", model=ov8),
+        loaded("OpenVINO", "int8", "NNCF, static, bf16 hint", "ov8", runtime="openvino", model=ov8, hint="bf16"),
         loaded("OpenVINO", "bf16", "hint", "ov", runtime="openvino", model=ov, hint="bf16"),
         torch("f32"), torch("bf16"), torch("int8"),
     ])

@@ -178,6 +178,30 @@ pub fn product_s8(ctx: Ctx, (m, k, n): (usize, usize, usize), after: After) -> L
     }
 }
 
+/// An int8 layer from f32 rows: rotated, quantized per row, multiplied.
+pub fn linear_s8(ctx: Ctx, (m, k, n): (usize, usize, usize)) -> Layer {
+    let (l, x, mut y) = (Linear::new(2, n, k), Aligned::of(&values(1, m * k)), Aligned::zeros(m * n));
+    let (mut q, mut steps) = (Aligned::zeros(m * padded_k(k)), vec![0.0; m]);
+    let mut one = move |ctx: Ctx, y: &mut [f32]| {
+        let before = Before { norm: None, rotation: Some(Rotation::new(k, &l.signs)) };
+        let rows = RowsS8Mut { m, k, data: q.get_mut(), scales: &mut steps };
+        quantize(ctx, Mat::new(x.get(), m, k), before, rows);
+        let a = RowsS8 { m, k, data: q.get(), scales: &steps };
+        let ep = Epilogue { bias: Some(&l.bias), ..Epilogue::default() };
+        gemm_s8(ctx, a, l.w.get(), ep, MatMut::new(y, m, n));
+    };
+    one(ctx, y.get_mut());
+    assert!(y.get().iter().all(|v| v.is_finite()) && y.get().iter().any(|v| *v != 0.0), "{m} x {k} x {n}");
+    Layer {
+        kind: "linear s8",
+        size: format!("{m}x{k}x{n}"),
+        ops: 2.0 * (m * k * n) as f64,
+        bytes: (4 * m * k + n * k + 4 * m * n) as f64,
+        peak: Peak::S8,
+        run: Box::new(move |ctx| one(ctx, y.get_mut())),
+    }
+}
+
 /// A product with f16 or f32 weights.
 pub fn product(ctx: Ctx, (m, k, n): (usize, usize, usize), f16: bool) -> Layer {
     let (a, rows, bias) = (values(1, m * k), values(2, n * k), values(3, n));
@@ -362,33 +386,33 @@ pub fn upsample(ctx: Ctx, (h, w, c): (usize, usize, usize)) -> Layer {
 /// (frames, tokens, heads, head width).
 pub type HeadsSize = (usize, usize, usize, usize);
 
-/// Which frames a query's frame sees.
+/// Which frames a query's frame sees: those from frame + `lo` to frame + `hi`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sees {
-    /// Itself.
-    Own,
-    /// All.
-    All,
-    /// The next only (the last frame none): a frame-structured mask.
-    Next,
+pub struct Sees {
+    /// Smallest difference of frames.
+    pub lo: i32,
+    /// Largest.
+    pub hi: i32,
 }
 
 impl Sees {
+    /// Its own frame.
+    pub const OWN: Sees = Sees { lo: 0, hi: 0 };
+    /// The next frame only; the last sees none.
+    pub const NEXT: Sees = Sees { lo: 1, hi: 1 };
+    /// All frames.
+    pub const ALL: Sees = Sees { lo: -64, hi: 64 };
+
     fn mask(self, frames: usize, tokens: usize) -> FrameMask {
-        let reach = frames as i32;
-        let (lo, hi) = match self {
-            Sees::Own => (0, 0),
-            Sees::All => (-reach, reach),
-            Sees::Next => (1, 1),
-        };
-        FrameMask { frames, tokens, lo, hi }
+        FrameMask { frames, tokens, lo: self.lo, hi: self.hi }
     }
 
-    fn name(self) -> &'static str {
+    fn name(self) -> String {
         match self {
-            Sees::Own => "own frame",
-            Sees::All => "all frames",
-            Sees::Next => "next frame",
+            Sees::OWN => "own frame".into(),
+            Sees::NEXT => "next frame".into(),
+            Sees::ALL => "all frames".into(),
+            Sees { lo, hi } => format!("frames {lo:+} to {hi:+}"),
         }
     }
 }
@@ -462,7 +486,7 @@ impl Linear {
     }
 }
 
-/// One transformer block of width 1024 or so with everything in it: norms, rotations, quantizations, q/k norm, rotary embedding, GELU,
+/// One transformer block of width 1024 or so with everything in it: norms, rotations, quantizations, rotary embedding, GELU,
 /// residuals. Operations of products and attention.
 pub fn block(ctx: Ctx, (frames, tokens, heads, d): HeadsSize, sees: Sees) -> Layer {
     let (mask, m, c) = (sees.mask(frames, tokens), frames * tokens, heads * d);
@@ -470,14 +494,12 @@ pub fn block(ctx: Ctx, (frames, tokens, heads, d): HeadsSize, sees: Sees) -> Lay
     let [qkv, proj, fc1, fc2] = std::array::from_fn(|i| Linear::new(10 + i as u64, layers[i].0, layers[i].1));
     let start = values(5, m * c);
     let table = RopeTable::new(&positions(tokens), d, 100.0, AngleRound::None);
-    let (ones, zeros) = (vec![1.0; d], vec![0.0; d]);
     let mut scratch = Aligned::zeros(scratch_len_s8(&mask, heads, d, ctx.pool.threads()));
     let (mut wide, mut mixed) = (Aligned::zeros(m * 4 * c), Aligned::zeros(m * c));
     let (mut q, mut steps) = (Aligned::zeros(m * 4 * c), vec![0.0; m]);
     let mut x = Aligned::of(&start);
     let exact = block_f32(ctx, &start, [&qkv, &proj, &fc1, &fc2], (&table, mask, heads));
     let mut one = move |ctx: Ctx, x: &mut [f32]| {
-        let qk = QkNorm { q_gain: &ones, q_offset: &zeros, k_gain: &ones, k_offset: &zeros, eps: 1e-5 };
         let mut linear = |l: &Linear, norm: bool, act: Act, residual: bool, x: &[f32], y: &mut [f32]| {
             let (n, k) = (l.w.n, l.w.k);
             let norm = norm.then_some(Norm { eps: 1e-6, affine: None });
@@ -490,7 +512,7 @@ pub fn block(ctx: Ctx, (frames, tokens, heads, d): HeadsSize, sees: Sees) -> Lay
         let wide = wide.get_mut();
         linear(&qkv, true, Act::None, false, x, &mut wide[..m * 3 * c]);
         let three = Mat::new(&wide[..m * 3 * c], m, 3 * c);
-        let h = Heads { qkv: three, heads, norm: Some(qk), rope: Some(&table), rotation: None };
+        let h = Heads { qkv: three, heads, norm: None, rope: Some(&table), rotation: None };
         attention_s8(ctx, h, mask, scratch.get_mut(), MatMut::new(mixed.get_mut(), m, c));
         linear(&proj, false, Act::None, true, mixed.get(), x);
         linear(&fc1, true, Act::Gelu, false, x, wide);
@@ -540,9 +562,7 @@ fn block_f32(
     };
     let mut x = x.to_vec();
     let mut three = linear(qkv, true, Act::None, &x);
-    let (ones, zeros) = (vec![1.0; d], vec![0.0; d]);
-    let norm = QkNorm { q_gain: &ones, q_offset: &zeros, k_gain: &ones, k_offset: &zeros, eps: 1e-5 };
-    qk_norm_rope(ctx, MatMut::new(&mut three, m, 3 * c), heads, Some(norm), Some(table));
+    qk_norm_rope(ctx, MatMut::new(&mut three, m, 3 * c), heads, None, Some(table));
     let mut scratch = vec![0.0; scratch_len(&mask, heads, d, ctx.pool.threads())];
     let mut mixed = vec![0.0; m * c];
     let out = MatMut::new(&mut mixed, m, c);
@@ -571,11 +591,11 @@ pub fn layers() -> Vec<Box<dyn Fn(Ctx) -> Layer>> {
     for size in [(884, 192, 768), (1956, 128, 512), (868, 1024, 1024)] {
         list.push(Box::new(move |ctx| product_s8(ctx, size, After::Quantized)));
     }
-    for (frames, tokens, sees) in [(4, 217, Sees::Own), (4, 217, Sees::All), (4, 745, Sees::Own), (4, 745, Sees::All)] {
+    for (frames, tokens, sees) in [(4, 217, Sees::OWN), (4, 217, Sees::ALL), (4, 745, Sees::OWN), (4, 745, Sees::ALL)] {
         list.push(Box::new(move |ctx| block(ctx, (frames, tokens, 16, 64), sees)));
     }
     for tokens in [221, 745] {
-        for sees in [Sees::Own, Sees::Next, Sees::All] {
+        for sees in [Sees::OWN, Sees::NEXT, Sees::ALL] {
             for int8 in [true, false] {
                 list.push(Box::new(move |ctx| attention(ctx, (4, tokens, 16, 72), sees, int8)));
             }

@@ -42,37 +42,62 @@ pub(crate) enum Width {
     Twelve,
 }
 
-/// Most f32 operations per second (two per multiply-add) that one thread reached in `time`, with these kernels.
-pub fn flops_per_second(kernels: &Kernels, time: Duration) -> f64 {
-    let start = Instant::now();
-    let mut best = 0.0f64;
-    let mut seed = 0.25f32;
-    while best == 0.0 || start.elapsed() < time {
-        for (width, vectors) in [(Width::Six, 6.0), (Width::Twelve, 12.0)] {
-            let t = Instant::now();
-            // The sum feeds the next start, so no round can be dropped.
-            seed = kernels.peak(width, seed).clamp(0.125, 0.25);
-            let ops = 2.0 * 16.0 * vectors * STEPS as f64;
-            best = best.max(ops / t.elapsed().as_secs_f64().max(1e-9));
-        }
-    }
-    best
+/// Operations per second of one thread.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Rates {
+    /// In the best round, some 20 microseconds: what the CPU can do.
+    pub best: f64,
+    /// Over the whole time: what it had to give while others shared it.
+    pub mean: f64,
 }
 
-/// Most int8 operations per second (two per multiply-add) that one thread reached in `time`, with the dot product of these
-/// kernels.
-pub fn s8_ops_per_second(kernels: &Kernels, time: Duration) -> f64 {
+/// Rounds of `round`, which does some operations and returns how many, for `time` or at least once.
+fn rates(time: Duration, mut round: impl FnMut() -> f64) -> Rates {
     let start = Instant::now();
-    let mut best = 0.0f64;
-    let mut seed = 1;
-    while best == 0.0 || start.elapsed() < time {
+    let (mut best, mut all) = (0.0f64, 0.0);
+    loop {
         let t = Instant::now();
+        let ops = round();
+        best = best.max(ops / t.elapsed().as_secs_f64().max(1e-9));
+        all += ops;
+        if start.elapsed() >= time {
+            return Rates { best, mean: all / start.elapsed().as_secs_f64().max(1e-9) };
+        }
+    }
+}
+
+/// f32 operations per second (two per multiply-add) that one thread reaches in `time`, with these kernels.
+pub fn flops(kernels: &Kernels, time: Duration) -> Rates {
+    let mut seed = 0.25f32;
+    // The sum feeds the next start, so no round can be dropped.
+    let mut of = |width, vectors: f64, time| {
+        rates(time, || {
+            seed = kernels.peak(width, seed).clamp(0.125, 0.25);
+            2.0 * 16.0 * vectors * STEPS as f64
+        })
+    };
+    let (six, twelve) = (of(Width::Six, 6.0, time / 2), of(Width::Twelve, 12.0, time / 2));
+    Rates { best: six.best.max(twelve.best), mean: six.mean.max(twelve.mean) }
+}
+
+/// int8 operations per second (two per multiply-add) that one thread reaches in `time`, with the dot product of these kernels.
+pub fn s8_ops(kernels: &Kernels, time: Duration) -> Rates {
+    let mut seed = 1;
+    rates(time, || {
         seed = kernels.peak_s8(seed);
         // Four products for each output of the tile.
-        let ops = 2.0 * 4.0 * (kernels.product_s8.mr * kernels.product_s8.nr * PEAK_STEPS) as f64;
-        best = best.max(ops / t.elapsed().as_secs_f64().max(1e-9));
-    }
-    best
+        2.0 * 4.0 * (kernels.product_s8.mr * kernels.product_s8.nr * PEAK_STEPS) as f64
+    })
+}
+
+/// Most f32 operations per second of one thread in `time`.
+pub fn flops_per_second(kernels: &Kernels, time: Duration) -> f64 {
+    flops(kernels, time).best
+}
+
+/// Most int8 operations per second of one thread in `time`.
+pub fn s8_ops_per_second(kernels: &Kernels, time: Duration) -> f64 {
+    s8_ops(kernels, time).best
 }
 
 /// Sum of what `probe` ([`flops_per_second`] or [`s8_ops_per_second`]) gives on `threads` threads at once, operations per second: cores
