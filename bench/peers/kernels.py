@@ -34,9 +34,9 @@ def ours(threads, kind, sizes, precision="int8", note=""):
     return Peer("StreetForward", precision, [str(v) for v in [worker, "work", threads, kind, *sizes]], note=note)
 
 
-def peer(name, precision, note, threads, **spec):
+def peer(name, shown, note, threads, **spec):
     spec = {"kind": "op", "threads": threads, "precision": "f32", **spec}
-    return Peer(name, precision, python(spec), baseline=(), note=note)
+    return Peer(name, shown, python(spec), baseline=(), note=note)
 
 
 def sets(kinds, threads, work):
