@@ -108,16 +108,16 @@ impl Renderer {
         let mut next = 0u32;
         for (group, first) in groups.iter().zip(first_slot.iter_mut()) {
             first.clear();
-            for spot in &group.spots {
+            for tiles in group.seen.tiles() {
                 first.push(next);
                 // The sum over all is limited when the image is drawn.
-                next += spot.tiles() as u32;
+                next += tiles;
             }
         }
         slots.clear();
         slots.resize_with(next as usize, Slot::default);
         let shared = Shared {
-            records: std::array::from_fn(|g| &groups[g].records[..]),
+            records: std::array::from_fn(|g| groups[g].seen.records()),
             form: KeyForm::of(drawn.gaussians),
             a_max: drawn.settings.a_max,
             extra: Channels { channels: 0, values: &[] },
@@ -162,7 +162,7 @@ impl Renderer {
         self.pool.run(GROUPS, &|g, _| {
             let (group, part) = (read(&self.groups[g]), &mut *lock(&parts[g]));
             let start = bin::run(scene.len(), g).start;
-            for (record, &first) in group.records.iter().zip(&self.back.first_slot[g]) {
+            for (record, &first) in group.seen.records().iter().zip(&self.back.first_slot[g]) {
                 let mut sums = [0.0f64; SUMS];
                 for slot in &self.back.slots[first as usize..][..record.spot().tiles() as usize] {
                     for (sum, value) in sums.iter_mut().zip(slot) {

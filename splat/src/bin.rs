@@ -11,8 +11,9 @@
 
 use sf_formats::scene::Gaussians;
 use sf_ops::Kernels;
+use sf_ops::simd::{Body, Simd};
 
-use crate::project::{Counts, Project, Projector, Record, Rect, Spot, TILE};
+use crate::project::{Counts, Project, Projector, Rect, Seen, TILE};
 
 /// Number of runs the scene is cut into. Fixed, not the number of threads.
 pub const GROUPS: usize = 16;
@@ -39,12 +40,12 @@ impl KeyForm {
     }
 
     #[inline(always)]
-    fn pack(self, z: f32, group: usize, record: usize, rect: Rect) -> u64 {
+    fn pack(self, z: f32, group: usize, record: usize, rect: u32) -> u64 {
         let z = u64::from(z.to_bits()) << 33;
         match self {
             KeyForm::Short => {
                 let name = group << Self::SHORT_RECORD_BITS | record;
-                z | (name as u64) << Self::RECT_BITS | u64::from(rect.pack())
+                z | (name as u64) << Self::RECT_BITS | u64::from(rect)
             }
             KeyForm::Long => z | (group << (32 - GROUP_BITS) | record) as u64,
         }
@@ -85,10 +86,8 @@ pub fn run(gaussians: usize, group: usize) -> std::ops::Range<usize> {
 /// One run of the scene on the screen. All memory is kept between images.
 #[derive(Debug, Default)]
 pub struct Group {
-    /// The visible Gaussians of the run, in index order.
-    pub records: Vec<Record>,
-    /// Where they lie.
-    pub spots: Vec<Spot>,
+    /// The visible Gaussians of the run.
+    pub seen: Seen,
     /// What was dropped or clamped.
     pub counts: Counts,
     /// Entries this group makes: the sum over its records of the tiles they meet.
@@ -96,6 +95,114 @@ pub struct Group {
     /// `keys[starts[t]..starts[t + 1]]` are those of tile `t`.
     starts: Vec<u32>,
     keys: Vec<u64>,
+}
+
+/// Records whose tiles are found together: a loop over an array, which the compiler makes vectors of.
+const BATCH: usize = 64;
+
+/// Tiles that records meet.
+struct Met {
+    /// The first.
+    tile: [u32; BATCH],
+    /// Further columns and rows of tiles, `columns | rows << 16`.
+    more: [u32; BATCH],
+    /// The rectangle of blocks, each axis modulo a tile: of a record in one tile, its rectangle.
+    rect: [u32; BATCH],
+}
+
+impl Met {
+    /// Of up to [`BATCH`] records, from the bits of their columns and rows.
+    #[inline(always)]
+    fn new(x: &[f32], y: &[f32], columns: u32) -> Met {
+        let mut met = Met { tile: [0; BATCH], more: [0; BATCH], rect: [0; BATCH] };
+        for (i, (x, y)) in x.iter().zip(y).enumerate().take(BATCH) {
+            let (x, y) = (x.to_bits(), y.to_bits());
+            let (x0, x1) = (x & 0xffff, (x >> 16) - 1);
+            let (y0, y1) = (y & 0xffff, (y >> 16) - 1);
+            met.tile[i] = y0 / TILE * columns + x0 / TILE;
+            met.more[i] = (x1 / TILE - x0 / TILE) | (y1 / TILE - y0 / TILE) << 16;
+            met.rect[i] = (x0 >> 2 & 7) | (x1 >> 2 & 7) << 3 | (y0 >> 2 & 7) << 6 | (y1 >> 2 & 7) << 9;
+        }
+        met
+    }
+
+    /// Calls `f` with the number of every tile that record `i` meets and the bits of its rectangle there.
+    #[inline(always)]
+    fn each(&self, i: usize, columns: u32, mut f: impl FnMut(usize, u32)) {
+        let (tile, more, rect) = (self.tile[i], self.more[i], self.rect[i]);
+        if more == 0 {
+            return f(tile as usize, rect);
+        }
+        let (wide, high) = (more & 0xffff, more >> 16);
+        // From the first block in the first tile, from 0 in the others; to the last block in the last, to 7 before.
+        let span = |n: u32, last: u32, bits: u32| {
+            let lo = if n == 0 { bits & 7 } else { 0 };
+            let hi = if n == last { bits >> 3 & 7 } else { 7 };
+            lo | hi << 3
+        };
+        for row in 0..=high {
+            let rows = span(row, high, rect >> 6) << 6;
+            for column in 0..=wide {
+                f((tile + row * columns + column) as usize, rows | span(column, wide, rect));
+            }
+        }
+    }
+}
+
+/// Counts the keys of a group's records per tile and scatters them.
+struct Scatter<'a> {
+    seen: &'a Seen,
+    group: usize,
+    form: KeyForm,
+    /// Columns of tiles.
+    columns: u32,
+    /// All 0; one more than tiles.
+    starts: &'a mut [u32],
+    /// Room for all.
+    keys: &'a mut [u64],
+}
+
+impl Body for Scatter<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        // A form known to the compiler.
+        match self.form {
+            KeyForm::Short => self.scatter(KeyForm::Short),
+            KeyForm::Long => self.scatter(KeyForm::Long),
+        }
+    }
+}
+
+impl Scatter<'_> {
+    #[inline(always)]
+    fn scatter(self, form: KeyForm) {
+        let Scatter { seen, group, columns, starts, keys, .. } = self;
+        let (z, x, y) = seen.places();
+        let batches = || z.chunks(BATCH).zip(x.chunks(BATCH)).zip(y.chunks(BATCH));
+        for ((z, x), y) in batches() {
+            let met = Met::new(x, y, columns);
+            for i in 0..z.len().min(BATCH) {
+                met.each(i, columns, |t, _| starts[t + 1] += 1);
+            }
+        }
+        for t in 1..starts.len() {
+            starts[t] += starts[t - 1];
+        }
+        // Filling moves every start to its end, which is the next one's start; shifted back below.
+        for (batch, ((z, x), y)) in batches().enumerate() {
+            let met = Met::new(x, y, columns);
+            for (i, &z) in z.iter().enumerate().take(BATCH) {
+                met.each(i, columns, |t, rect| {
+                    keys[starts[t] as usize] = form.pack(z, group, batch * BATCH + i, rect);
+                    starts[t] += 1;
+                });
+            }
+        }
+        starts.copy_within(..starts.len() - 1, 1);
+        starts[0] = 0;
+    }
 }
 
 impl Group {
@@ -109,58 +216,29 @@ impl Group {
         run: std::ops::Range<usize>,
         usable: Option<&(dyn Fn(usize) -> bool + Sync)>,
     ) {
-        self.records.clear();
-        self.spots.clear();
         self.counts = Counts::default();
-        let (records, spots, counts) = (&mut self.records, &mut self.spots, &mut self.counts);
-        self.entries = kernels.enter(Project { projector, scene, run, usable, records, spots, counts });
+        let (seen, counts) = (&mut self.seen, &mut self.counts);
+        self.entries = kernels.enter(Project { projector, scene, run, usable, seen, counts });
     }
 
     /// Scatters the keys of the records to the tiles of an image of `tiles` (columns, rows).
     ///
     /// Panics if there are 2^32 entries or more; the caller has a lower limit.
-    pub fn bin(&mut self, group: usize, form: KeyForm, tiles: (u32, u32)) {
-        let (columns, count) = (tiles.0, tiles.0 as usize * tiles.1 as usize);
+    pub fn bin(&mut self, kernels: &Kernels, group: usize, form: KeyForm, tiles: (u32, u32)) {
         let entries = u32::try_from(self.entries).expect("fewer than 2^32 entries") as usize;
         self.starts.clear();
-        self.starts.resize(count + 1, 0);
-        for spot in &self.spots {
-            each_tile(spot, columns, |t, _| self.starts[t + 1] += 1);
-        }
-        // Every key is written below: what is left of another image needs no clearing.
+        self.starts.resize(tiles.0 as usize * tiles.1 as usize + 1, 0);
+        // Every key is written: what is left of another image needs no clearing.
         if self.keys.len() < entries {
             self.keys.resize(entries, 0);
         }
-        for t in 0..count {
-            self.starts[t + 1] += self.starts[t];
-        }
-        // Filling moves every start to its end, which is the next one's start; shifted back below.
-        for (i, spot) in self.spots.iter().enumerate() {
-            each_tile(spot, columns, |t, place| {
-                self.keys[self.starts[t] as usize] = form.pack(spot.z, group, i, spot.rect(place));
-                self.starts[t] += 1;
-            });
-        }
-        for t in (0..count).rev() {
-            self.starts[t + 1] = self.starts[t];
-        }
-        self.starts[0] = 0;
+        let (starts, keys) = (&mut self.starts[..], &mut self.keys[..entries]);
+        kernels.enter(Scatter { seen: &self.seen, group, form, columns: tiles.0, starts, keys });
     }
 
     /// The keys of one tile, unsorted.
     pub fn tile(&self, tile: usize) -> &[u64] {
         &self.keys[self.starts[tile] as usize..self.starts[tile + 1] as usize]
-    }
-}
-
-/// Calls `f` with the number and the first pixel of every tile that a record at `spot` meets.
-#[inline(always)]
-fn each_tile(spot: &Spot, columns: u32, mut f: impl FnMut(usize, (usize, usize))) {
-    let (x, y) = spot.tile_box();
-    for ty in y.0..y.1 {
-        for tx in x.0..x.1 {
-            f((ty * columns + tx) as usize, ((tx * TILE) as usize, (ty * TILE) as usize));
-        }
     }
 }
 
@@ -187,7 +265,7 @@ mod tests {
             let names = [(0, 0), (0, last), (7, 5), (15, 0), (15, last)];
             let keys: Vec<u64> = [0.01f32, 0.011, 4.0, 1e10]
                 .iter()
-                .flat_map(|&z| names.map(|(g, r)| form.pack(z, g, r, rect)))
+                .flat_map(|&z| names.map(|(g, r)| form.pack(z, g, r, rect.pack())))
                 .collect();
             assert!(keys.windows(2).all(|k| k[0] < k[1]));
             for (key, name) in keys.iter().zip(names.iter().cycle()) {

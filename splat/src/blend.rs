@@ -103,6 +103,8 @@ pub struct Tile {
     extra: Vec<[f32; LANES]>,
     /// The keys by depth bucket; the first ones of the vector.
     keys: Vec<u64>,
+    /// As long, for sorting.
+    spare: Vec<u64>,
     /// `starts[b]` of bucket b, one more for the end.
     starts: Box<[u32; BUCKETS + 1]>,
     chunk: Box<Chunk>,
@@ -132,6 +134,7 @@ impl Default for Tile {
             alive: 0,
             extra: Vec::new(),
             keys: Vec::new(),
+            spare: Vec::new(),
             starts: Box::new([0; BUCKETS + 1]),
             chunk: Box::new(Chunk {
                 shown: [Shown::default(); CHUNK],
@@ -205,11 +208,78 @@ impl Draw for Composite {
     }
 }
 
-/// Keys of one bucket: some ten, rarely many.
+/// Sorts the keys of one bucket: some ten, rarely many, no two equal. `spare` is as long.
+///
+/// Many are split by depth once more. Every step but the last keeps the order of keys of one depth, which is that of their indices.
 #[inline(always)]
-fn sort(keys: &mut [u64]) {
-    if keys.len() > 1 {
-        keys.sort_unstable();
+fn sort(form: KeyForm, keys: &mut [u64], spare: &mut [u64]) {
+    if keys.len() <= RANKED {
+        return sort_few(keys);
+    }
+    let (mut least, mut most) = (u64::MAX, 0);
+    for &key in &*keys {
+        least = least.min(key);
+        most = most.max(key);
+    }
+    let (least, range) = (form.depth(least), form.depth(most) - form.depth(least));
+    // About eight in each.
+    let wanted = (keys.len() / 8).next_power_of_two().min(FEWER_BUCKETS);
+    let shift = (u64::BITS - range.leading_zeros()).saturating_sub(wanted.trailing_zeros());
+    let bucket = |key: u64| ((form.depth(key) - least) >> shift) as usize % FEWER_BUCKETS;
+    let mut starts = [0u32; FEWER_BUCKETS + 1];
+    for &key in &*keys {
+        starts[bucket(key) + 1] += 1;
+    }
+    for b in 0..FEWER_BUCKETS {
+        starts[b + 1] += starts[b];
+    }
+    for &key in &*keys {
+        let at = &mut starts[bucket(key)];
+        spare[*at as usize] = key;
+        *at += 1;
+    }
+    keys.copy_from_slice(spare);
+    let mut start = 0;
+    for &end in &starts[..FEWER_BUCKETS] {
+        let few = &mut keys[start..end as usize];
+        start = end as usize;
+        if few.len() <= RANKED { sort_few(few) } else { few.sort_unstable() }
+    }
+}
+
+/// Most keys that are sorted by their ranks.
+const RANKED: usize = 32;
+/// Buckets of a bucket.
+const FEWER_BUCKETS: usize = 256;
+
+/// Sorts up to [`RANKED`] keys.
+#[inline(always)]
+fn sort_few(keys: &mut [u64]) {
+    match keys.len() {
+        0 | 1 => (),
+        2..=8 => rank::<8>(keys),
+        9..=16 => rank::<16>(keys),
+        _ => rank::<32>(keys),
+    }
+}
+
+/// Sorts up to N different keys: every one goes to the place that the number of smaller ones gives. No branch depends on the keys, and
+/// the comparisons are vectors.
+#[inline(always)]
+fn rank<const N: usize>(keys: &mut [u64]) {
+    // Signed, for instruction sets that compare nothing else.
+    let mut all = [i64::MAX; N];
+    for (to, &key) in all.iter_mut().zip(&*keys) {
+        *to = (key ^ 1 << 63) as i64;
+    }
+    let mut ranks = [0u64; N];
+    for &key in &all[..keys.len().min(N)] {
+        for (rank, &other) in ranks.iter_mut().zip(&all) {
+            *rank += u64::from(key < other);
+        }
+    }
+    for (&key, &rank) in all.iter().zip(&ranks).take(keys.len()) {
+        keys[rank as usize] = key as u64 ^ 1 << 63;
     }
 }
 
@@ -253,7 +323,7 @@ impl Tile {
                 tile.keys[kept] = key;
                 kept += usize::from(mask & tile.alive != 0);
             }
-            sort(&mut tile.keys[sorted..kept]);
+            sort(form, &mut tile.keys[sorted..kept], &mut tile.spare[..kept - sorted]);
             // Records lie in index order and are wanted in depth order: nearly every one is a cache miss, so all
             // of a chunk are on their way before the first is read.
             for &key in &tile.keys[sorted..kept] {
@@ -276,15 +346,17 @@ impl Tile {
 
     /// Starts a tile: T = 1 inside the image, finished outside.
     pub fn clear(&mut self, place: Place, channels: usize) {
-        self.alive = 0;
-        for (i, block) in self.blocks.iter_mut().enumerate() {
-            let (y0, x0) = (i / PER_ROW * BLOCK, i % PER_ROW * BLOCK);
-            for l in 0..LANES {
-                let inside = y0 + l / BLOCK < place.height && x0 + l % BLOCK < place.width;
-                block.t[l] = if inside { 1.0 } else { -1.0 };
+        self.alive = u64::MAX;
+        self.blocks.fill(Block { t: [1.0; LANES], sum: [[0.0; LANES]; 4] });
+        if place.width < SIDE || place.height < SIDE {
+            for (i, block) in self.blocks.iter_mut().enumerate() {
+                let (y0, x0) = (i / PER_ROW * BLOCK, i % PER_ROW * BLOCK);
+                for l in 0..LANES {
+                    let inside = y0 + l / BLOCK < place.height && x0 + l % BLOCK < place.width;
+                    block.t[l] = if inside { 1.0 } else { -1.0 };
+                }
+                self.alive &= !(u64::from(y0 >= place.height || x0 >= place.width) << i);
             }
-            block.sum = [[0.0; LANES]; 4];
-            self.alive |= u64::from(y0 < place.height && x0 < place.width) << i;
         }
         self.extra.clear();
         self.extra.resize(BLOCKS * channels, [0.0; LANES]);
@@ -294,11 +366,16 @@ impl Tile {
 
     /// Makes room for lists of up to `entries` keys and for extra sums, so that no tile of an image allocates.
     pub fn reserve(&mut self, entries: usize, channels: usize) {
-        if self.keys.len() < entries {
-            self.keys.resize(entries, 0);
-        }
+        self.room(entries);
         self.extra.clear();
         self.extra.reserve(BLOCKS * channels);
+    }
+
+    fn room(&mut self, entries: usize) {
+        if self.keys.len() < entries {
+            self.keys.resize(entries, 0);
+            self.spare.resize(entries, 0);
+        }
     }
 
     /// Blocks that took a Gaussian since [`Tile::clear`], counted once per pair.
@@ -307,6 +384,7 @@ impl Tile {
     }
 
     /// Orders keys by bucket of depth, not inside a bucket, and returns the number of buckets.
+    #[inline(always)]
     fn split(&mut self, lists: &[&[u64]; bin::GROUPS], form: KeyForm) -> usize {
         let (mut least, mut most, mut len) = (u64::MAX, 0, 0);
         for list in lists {
@@ -316,9 +394,7 @@ impl Tile {
                 most = most.max(key);
             }
         }
-        if self.keys.len() < len {
-            self.keys.resize(len, 0);
-        }
+        self.room(len);
         let split = &mut self.keys[..len];
         let Some(range) = form.depth(most).checked_sub(form.depth(least)) else { return 0 };
         let least = form.depth(least);
@@ -373,7 +449,7 @@ impl Tile {
     fn deal(&mut self, r: &Record, place: Place, blocks: u64) {
         let chunk = &mut *self.chunk;
         let at = chunk.len % CHUNK;
-        let (x, y) = (place.x as f32 - f32::from(r.x.0), place.y as f32 - f32::from(r.y.0));
+        let (x, y) = (place.x as f32 - f32::from(r.x[0]), place.y as f32 - f32::from(r.y[0]));
         chunk.shown[at] = Shown {
             d: r.cx.mul_add(x, r.dy.mul_add(y, r.d)),
             cx: r.cx,
@@ -425,13 +501,21 @@ impl Tile {
         }
     }
 
-    /// Four neighbouring pixels of row `y`, from column `4 column`: T, and the sums of red, green, blue and z.
+    /// Four rows of sixteen pixels from block `(column, row)` on: T with the sign of life, and the sums of red, green, blue and z.
     #[inline(always)]
-    pub fn four(&self, column: usize, y: usize) -> ([f32; BLOCK], [[f32; BLOCK]; 4]) {
-        let block = &self.blocks[y / BLOCK * PER_ROW + column];
-        let row = |v: &[f32; LANES]| v.as_chunks::<BLOCK>().0[y % BLOCK];
-        let sums = [row(&block.sum[0]), row(&block.sum[1]), row(&block.sum[2]), row(&block.sum[3])];
-        (row(&block.t).map(f32::abs), sums)
+    pub(crate) fn rows<S: Simd>(&self, s: S, column: usize, row: usize) -> [[S::V; BLOCK]; 5] {
+        let blocks = &self.blocks[row * PER_ROW + column..][..BLOCK];
+        let mut rows = [[s.splat(0.0); BLOCK]; 5];
+        for (i, block) in blocks.iter().enumerate() {
+            rows[0][i] = s.load(&block.t);
+            for c in 0..4 {
+                rows[1 + c][i] = s.load(&block.sum[c]);
+            }
+        }
+        for row in &mut rows {
+            *row = s.transpose_quads(*row);
+        }
+        rows
     }
 
     /// The extra sums of a pixel of the tile.
@@ -477,13 +561,13 @@ impl Shown {
         let (d, e) = self.form(s, at);
         let q = d.mul_add(d, e.mul_add(e, s.splat(self.nlo)));
         let raw = exp2_neg(s, q);
-        let alpha = cut.select_gt(q, a_max.select_gt(raw, raw, a_max), zero);
-        let weight = alpha * t;
-        let next = t - weight;
+        let alpha = cut.select_gt(q, raw.min(a_max), zero);
+        // T is what one Gaussian waits for the other: one multiply-add, one comparison, one choice.
+        let next = alpha.neg_mul_add(t, t);
         Step {
             alpha,
-            weight: next.select_gt(stop, weight, zero),
-            t: next.select_gt(stop, next, t.abs().negate(u16::MAX)),
+            weight: next.select_gt(stop, alpha * t, zero),
+            t: next.select_gt(stop, next, t.minus_abs()),
             going: next.gt_bits(stop),
         }
     }
@@ -491,10 +575,48 @@ impl Shown {
 
 /// One block takes its list; how many entries it took and whether a pixel is still unfinished.
 ///
-/// First the weights with T alone in registers, then the sums: together they are ten registers of AVX2's sixteen, and
-/// what did not fit was T, on its way through memory from one Gaussian to the next.
+/// In one go where the registers hold it. Else first the weights with T alone in registers, then the sums: together
+/// they are ten registers of AVX2's sixteen, and what did not fit was T, on its way through memory from one Gaussian to the next.
+/// A pixel adds the same numbers in the same order either way.
 #[inline(always)]
 fn take<S: Simd>(
+    s: S,
+    block: &mut Block,
+    at: (S::V, S::V),
+    list: &[u8],
+    chunk: (&[Shown; CHUNK], &mut [Line; CHUNK]),
+    shared: &Shared,
+    extra: &mut [[f32; LANES]],
+) -> (usize, bool) {
+    if S::REGISTERS < 32 || !extra.is_empty() {
+        return take_twice(s, block, at, list, chunk, shared, extra);
+    }
+    let (shown, _) = chunk;
+    let mut t = s.load(&block.t);
+    let mut sums = [s.load(&block.sum[0]), s.load(&block.sum[1]), s.load(&block.sum[2]), s.load(&block.sum[3])];
+    let (mut taken, mut alive) = (list.len(), true);
+    for (n, &i) in list.iter().enumerate() {
+        let o = &shown[usize::from(i)];
+        let step = o.step(s, at, t, shared.a_max);
+        t = step.t;
+        for (sum, value) in sums.iter_mut().zip(o.value) {
+            *sum = step.weight.mul_add(s.splat(value), *sum);
+        }
+        if step.going == 0 {
+            (taken, alive) = (n + 1, false);
+            break;
+        }
+    }
+    t.store(&mut block.t);
+    for (sum, to) in sums.into_iter().zip(&mut block.sum) {
+        sum.store(to);
+    }
+    (taken, alive)
+}
+
+/// [`take`], first the weights and then the sums.
+#[inline(always)]
+fn take_twice<S: Simd>(
     s: S,
     block: &mut Block,
     at: (S::V, S::V),

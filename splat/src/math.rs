@@ -8,7 +8,7 @@ use sf_ops::simd::{LANES, Simd, Vector};
 /// 2^-x for x in -0.5..=126; relative error below 4e-7. Outside that range the value is meaningless.
 ///
 /// -x = n - f with |f| <= 1/2, 2^-f by a polynomial of degree 5 that interpolates at the Chebyshev nodes
-/// (1.6e-7 before rounding), 2^n by adding to the exponent.
+/// (1.6e-7 before rounding), 2^n by adding to the exponent of what the polynomial gave, 0.7 to 1.42.
 #[inline(always)]
 pub fn exp2_neg<S: Simd>(s: S, x: S::V) -> S::V {
     // 1.5 * 2^23 less x holds the rounded integer in the low mantissa bits.
@@ -21,7 +21,7 @@ pub fn exp2_neg<S: Simd>(s: S, x: S::V) -> S::V {
     let p = p.mul_add(f, s.splat(0.240_221_07));
     let p = p.mul_add(f, s.splat(-std::f32::consts::LN_2));
     let p = p.mul_add(f, s.splat(1.0));
-    p * shifted.pow2_of_low_bits(127)
+    p.times_pow2_of_low_bits(shifted)
 }
 
 /// log2 of normal positive values, absolute error below 6e-7 for values in 1/255..=1.

@@ -20,6 +20,7 @@
 
 use std::ops::Range;
 
+use bytemuck::{Pod, Zeroable};
 use glam::{DMat3, DVec3};
 use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
@@ -53,16 +54,16 @@ pub const EASY_TRACE: f32 = 1e4;
 const EASY_RATIO: f32 = 0.02;
 
 /// A visible Gaussian on the screen; one cache line.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub struct Record {
-    /// d at the centre of pixel `(x.0, y.0)`.
+    /// d at the centre of pixel `(x[0], y[0])`.
     pub d: f32,
     /// Change of d per column.
     pub cx: f32,
     /// Change of d per row.
     pub dy: f32,
-    /// e in row `y.0`.
+    /// e in row `y[0]`.
     pub e: f32,
     /// Change of e per row.
     pub ar: f32,
@@ -74,10 +75,11 @@ pub struct Record {
     pub rgb: [f32; 3],
     /// Which Gaussian of the scene.
     pub index: u32,
-    /// Pixels touched: columns `x.0..x.1`, not empty, inside the image.
-    pub x: (u16, u16),
-    /// Pixels touched: rows `y.0..y.1`, not empty, inside the image.
-    pub y: (u16, u16),
+    /// Pixels touched: columns `x[0]..x[1]`, not empty, inside the image.
+    pub x: [u16; 2],
+    /// Pixels touched: rows `y[0]..y[1]`, not empty, inside the image.
+    pub y: [u16; 2],
+    unused: [u32; 3],
 }
 
 /// Blocks of a tile, first and last of either axis, 0..=7.
@@ -129,22 +131,20 @@ const fn spans(apart: usize) -> [u64; 64] {
     table
 }
 
-/// What binning needs of a record, packed: the records themselves are read only where they are drawn.
+/// Where a record lies.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spot {
-    /// Camera z.
-    pub z: f32,
-    /// Columns `x.0..x.1`.
-    pub x: (u16, u16),
-    /// Rows `y.0..y.1`.
-    pub y: (u16, u16),
+    /// Columns `x[0]..x[1]`.
+    pub x: [u16; 2],
+    /// Rows `y[0]..y[1]`.
+    pub y: [u16; 2],
 }
 
 impl Record {
     /// Where it lies.
     #[inline(always)]
     pub fn spot(&self) -> Spot {
-        Spot { z: self.z, x: self.x, y: self.y }
+        Spot { x: self.x, y: self.y }
     }
 
     /// The blocks of the tile with first pixel `tile` that the pixel box meets; it must meet the tile.
@@ -158,7 +158,7 @@ impl Spot {
     /// The blocks of the tile with first pixel `(x, y)` that the pixel box meets; it must meet the tile.
     #[inline(always)]
     pub fn rect(&self, (x, y): (usize, usize)) -> Rect {
-        let span = |(lo, hi): (u16, u16), first: usize| {
+        let span = |[lo, hi]: [u16; 2], first: usize| {
             let lo = usize::from(lo).max(first) - first;
             let hi = (usize::from(hi) - 1 - first).min(TILE as usize - 1);
             ((lo / BLOCK) as u8, (hi / BLOCK) as u8)
@@ -176,8 +176,76 @@ impl Spot {
     /// Tile columns and rows of the pixel box, half open.
     #[inline(always)]
     pub fn tile_box(&self) -> ((u32, u32), (u32, u32)) {
-        let span = |p: (u16, u16)| (u32::from(p.0) / TILE, (u32::from(p.1) - 1) / TILE + 1);
+        let span = |p: [u16; 2]| (u32::from(p[0]) / TILE, (u32::from(p[1]) - 1) / TILE + 1);
         (span(self.x), span(self.y))
+    }
+}
+
+/// The visible Gaussians of a run, in index order; the memory is kept between images.
+///
+/// What binning needs lies apart, packed: the records themselves are read only where they are drawn.
+#[derive(Debug, Default)]
+pub struct Seen {
+    /// The first `len` are of this image, as in all vectors.
+    records: Vec<Record>,
+    len: usize,
+    /// Camera z.
+    z: Vec<f32>,
+    /// The bits of `x[0] | x[1] << 16`.
+    x: Vec<f32>,
+    /// The bits of `y[0] | y[1] << 16`.
+    y: Vec<f32>,
+}
+
+impl Seen {
+    /// The records.
+    #[inline(always)]
+    pub fn records(&self) -> &[Record] {
+        &self.records[..self.len]
+    }
+
+    /// Camera z, and the bits of the columns `x[0] | x[1] << 16` and of the rows of every record.
+    #[inline(always)]
+    pub fn places(&self) -> (&[f32], &[f32], &[f32]) {
+        (&self.z[..self.len], &self.x[..self.len], &self.y[..self.len])
+    }
+
+    /// The number of tiles that every record meets.
+    pub fn tiles(&self) -> impl Iterator<Item = u32> {
+        let (_, x, y) = self.places();
+        x.iter().zip(y).map(|(&x, &y)| tiles_met(x) * tiles_met(y))
+    }
+
+    fn clear(&mut self) {
+        self.len = 0;
+    }
+
+    /// Room for sixteen more; half as much again when it is short.
+    #[inline(always)]
+    fn room(&mut self) {
+        if self.records.len() < self.len + LANES {
+            self.grow();
+        }
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn grow(&mut self) {
+        let len = (self.len + self.len / 2).max(1024) + LANES;
+        self.records.resize(len, Record::zeroed());
+        for plane in [&mut self.z, &mut self.x, &mut self.y] {
+            plane.resize(len, 0.0);
+        }
+    }
+
+    /// Appends one.
+    fn push(&mut self, record: Record) {
+        self.room();
+        let at = self.len;
+        let pair = |p: [u16; 2]| f32::from_bits(u32::from(p[0]) | u32::from(p[1]) << 16);
+        self.records[at] = record;
+        (self.z[at], self.x[at], self.y[at]) = (record.z, pair(record.x), pair(record.y));
+        self.len = at + 1;
     }
 }
 
@@ -315,7 +383,7 @@ impl Projector {
         let half_log2e = 0.5 * std::f64::consts::LOG2_E;
         let (cx, ar) = ((half_log2e * syy / det).sqrt(), (half_log2e / syy).sqrt());
         let dy = -cx * (sxy / syy);
-        let (du, dv) = (f64::from(x.0) + 0.5 - u, f64::from(y.0) + 0.5 - v);
+        let (du, dv) = (f64::from(x[0]) + 0.5 - u, f64::from(y[0]) + 0.5 - v);
         Some(Record {
             d: (cx * du + dy * dv) as f32,
             cx: cx as f32,
@@ -328,6 +396,7 @@ impl Projector {
             index: i as u32,
             x,
             y,
+            unused: [0; 3],
         })
     }
 
@@ -374,12 +443,19 @@ pub struct Project<'a> {
     pub run: Range<usize>,
     /// A further test of a visible Gaussian; those that fail it count as not finite.
     pub usable: Option<&'a (dyn Fn(usize) -> bool + Sync)>,
-    /// Where visible ones go, in index order.
-    pub records: &'a mut Vec<Record>,
-    /// Where their places go.
-    pub spots: &'a mut Vec<Spot>,
+    /// Where visible ones go; emptied first.
+    pub seen: &'a mut Seen,
     /// What was dropped or clamped.
     pub counts: &'a mut Counts,
+}
+
+/// Fields of sixteen Gaussians, as the scene holds them.
+struct Sixteen<'a> {
+    mean: &'a [[f32; 3]; LANES],
+    scale: &'a [[f32; 3]; LANES],
+    quat: &'a [[f32; 4]; LANES],
+    opacity: &'a [f32; LANES],
+    colour: &'a [[f32; 3]; LANES],
 }
 
 impl Body for Project<'_> {
@@ -388,83 +464,129 @@ impl Body for Project<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> u64 {
-        let Project { projector, scene, run, usable, records, spots, counts } = self;
+        let Project { projector, scene, run, usable, seen, counts } = self;
+        seen.clear();
         let mut entries = 0;
-        for start in run.clone().step_by(LANES) {
-            let lanes = (run.end - start).min(LANES);
-            let mut rows = [[0.0; LANES]; LANES];
-            for (l, row) in rows.iter_mut().enumerate().take(lanes) {
-                let i = start + l;
-                row[0..3].copy_from_slice(&scene.mean[i]);
-                row[3..6].copy_from_slice(&scene.scale[i]);
-                row[6..10].copy_from_slice(&scene.quat[i]);
-                row[10] = scene.opacity[i];
-                row[11..14].copy_from_slice(&scene.colour[i]);
-            }
-            s.transpose(&mut rows);
-            let (easy, hard) = projector.sixteen(s, &mut rows, start as u32);
+        let mut rows = [[0.0; LANES]; LANES];
+        let (mean, rest) = scene.mean[run.clone()].as_chunks::<LANES>();
+        let (scale, _) = scene.scale[run.clone()].as_chunks::<LANES>();
+        let (quat, _) = scene.quat[run.clone()].as_chunks::<LANES>();
+        let (opacity, _) = scene.opacity[run.clone()].as_chunks::<LANES>();
+        let (colour, _) = scene.colour[run.clone()].as_chunks::<LANES>();
+        let mut start = run.start;
+        for ((((mean, scale), quat), opacity), colour) in mean.iter().zip(scale).zip(quat).zip(opacity).zip(colour) {
+            let fields = Sixteen { mean, scale, quat, opacity, colour };
+            let lanes = projector.sixteen(s, &fields, &mut rows, start as u32);
+            entries += keep(s, (projector, scene, start), &mut rows, lanes, usable, seen, counts);
+            start += LANES;
+        }
+        if !rest.is_empty() {
+            // The last ones, and zeros.
+            let lanes = rest.len();
+            let (mut mean, mut scale, mut colour) = ([[0.0; 3]; LANES], [[0.0; 3]; LANES], [[0.0; 3]; LANES]);
+            let (mut quat, mut opacity) = ([[0.0; 4]; LANES], [0.0; LANES]);
+            let last = start..run.end;
+            mean[..lanes].copy_from_slice(rest);
+            scale[..lanes].copy_from_slice(&scene.scale[last.clone()]);
+            quat[..lanes].copy_from_slice(&scene.quat[last.clone()]);
+            opacity[..lanes].copy_from_slice(&scene.opacity[last.clone()]);
+            colour[..lanes].copy_from_slice(&scene.colour[last]);
+            let fields =
+                Sixteen { mean: &mean, scale: &scale, quat: &quat, opacity: &opacity, colour: &colour };
             let valid = (u32::from(u16::MAX) >> (LANES - lanes)) as u16;
-            let mut left = (easy | hard) & valid;
-            if easy & valid != 0 {
-                s.transpose(&mut rows);
-            }
-            while left != 0 {
-                let l = left.trailing_zeros() as usize % LANES;
-                left &= left - 1;
-                let record = if easy >> l & 1 != 0 {
-                    unpack(&rows[l])
-                } else {
-                    let Some(record) = projector.project(scene, start + l, counts) else { continue };
-                    record
-                };
-                if usable.is_some_and(|usable| !usable(start + l)) {
-                    counts.nonfinite += 1;
-                    continue;
-                }
-                records.push(record);
-                let spot = record.spot();
-                spots.push(spot);
-                entries += spot.tiles();
-            }
+            let (easy, hard) = projector.sixteen(s, &fields, &mut rows, start as u32);
+            let lanes = (easy & valid, hard & valid);
+            entries += keep(s, (projector, scene, start), &mut rows, lanes, usable, seen, counts);
         }
         entries
     }
 }
 
-/// A record from its row of the transposed output of [`Projector::sixteen`].
+/// Appends the visible ones of sixteen, and returns the tiles they meet: `easy` lanes from the fields of records in `rows`, `hard` lanes by
+/// the f64 path.
 #[inline(always)]
-fn unpack(row: &[f32; LANES]) -> Record {
-    let pair = |v: f32| (v.to_bits() as u16, (v.to_bits() >> 16) as u16);
-    Record {
-        d: row[0],
-        cx: row[1],
-        dy: row[2],
-        e: row[3],
-        ar: row[4],
-        nlo: row[5],
-        z: row[6],
-        rgb: [row[7], row[8], row[9]],
-        index: row[10].to_bits(),
-        x: pair(row[11]),
-        y: pair(row[12]),
+fn keep<S: Simd>(
+    s: S,
+    (projector, scene, start): (&Projector, &Gaussians, usize),
+    rows: &mut [[f32; LANES]; LANES],
+    (easy, hard): (u16, u16),
+    usable: Option<&(dyn Fn(usize) -> bool + Sync)>,
+    seen: &mut Seen,
+    counts: &mut Counts,
+) -> u64 {
+    if easy | hard == 0 {
+        return 0;
     }
+    seen.room();
+    let at = seen.len;
+    let mut entries = 0;
+    if hard == 0 && usable.is_none() {
+        let room = at..at + LANES;
+        for (field, plane) in [(Z_ROW, &mut seen.z), (X_ROW, &mut seen.x), (Y_ROW, &mut seen.y)] {
+            let to = plane[room.clone()].as_mut_array().unwrap_or_else(|| unreachable!());
+            s.store_chosen(s.load(&rows[field]), easy, to);
+        }
+        s.transpose(rows);
+        // Every row is written, and the next one over it where it is not visible: no branch to guess.
+        let to: &mut [Record; LANES] = seen.records[room].as_mut_array().unwrap_or_else(|| unreachable!());
+        let mut n = 0;
+        for l in 0..LANES {
+            to[n % LANES] = bytemuck::cast(rows[l]);
+            n += usize::from(easy >> l & 1);
+        }
+        seen.len = at + n;
+    } else {
+        s.transpose(rows);
+        let mut left = easy | hard;
+        while left != 0 {
+            let l = left.trailing_zeros() as usize % LANES;
+            left &= left - 1;
+            let record = if easy >> l & 1 != 0 {
+                bytemuck::cast(rows[l])
+            } else {
+                let Some(record) = projector.project(scene, start + l, counts) else { continue };
+                record
+            };
+            if usable.is_some_and(|usable| !usable(start + l)) {
+                counts.nonfinite += 1;
+                continue;
+            }
+            seen.push(record);
+        }
+    }
+    for (&x, &y) in seen.x[at..seen.len].iter().zip(&seen.y[at..seen.len]) {
+        entries += u64::from(tiles_met(x)) * u64::from(tiles_met(y));
+    }
+    entries
 }
 
+/// Tiles of one axis that pixels `lo..hi` meet, from the bits `lo | hi << 16`.
+#[inline(always)]
+fn tiles_met(pixels: f32) -> u32 {
+    let bits = pixels.to_bits();
+    ((bits >> 16) - 1) / TILE - (bits & 0xffff) / TILE + 1
+}
+
+/// Rows of the transposed fields of a record.
+const Z_ROW: usize = 6;
+const X_ROW: usize = 11;
+const Y_ROW: usize = 12;
+
 impl Projector {
-    /// Sixteen Gaussians, field by field: in `rows`, mean 0..3, scale 3..6, quaternion 6..10, opacity, colour 11..14;
-    /// out, the fields of [`unpack`]. Returns the lanes that are visible, and those that need the f64 path.
+    /// Sixteen Gaussians to records, field by field. Returns the lanes that are visible, and those that need the f64 path.
     #[inline(always)]
-    fn sixteen<S: Simd>(&self, s: S, rows: &mut [[f32; LANES]; LANES], first: u32) -> (u16, u16) {
+    fn sixteen<S: Simd>(&self, s: S, given: &Sixteen, rows: &mut [[f32; LANES]; LANES], first: u32) -> (u16, u16) {
         let (zero, one) = (s.splat(0.0), s.splat(1.0));
 
         // Fields that need no rule.
-        let scale = [s.load(&rows[3]), s.load(&rows[4]), s.load(&rows[5])];
-        let [w, x, y, z] = [s.load(&rows[6]), s.load(&rows[7]), s.load(&rows[8]), s.load(&rows[9])];
-        let opacity = s.load(&rows[10]);
+        let (mean, scale, colour) = (s.load3(given.mean), s.load3(given.scale), s.load3(given.colour));
+        let [w, x, y, z] = s.load4(given.quat);
+        let opacity = s.load(given.opacity);
         // 0 times a number is 0 unless the number is not finite.
         let mut unfinite = zero;
-        for i in [0, 1, 2, 11, 12, 13] {
-            unfinite = s.load(&rows[i]).mul_add(zero, unfinite);
+        for i in 0..3 {
+            unfinite = mean[i].mul_add(zero, unfinite);
+            unfinite = colour[i].mul_add(zero, unfinite);
         }
         let norm2 = w.mul_add(w, x.mul_add(x, y.mul_add(y, z * z)));
         // Squares of tiny ones underflow: below 1e-15 they are lengthened by 2^100 first.
@@ -479,12 +601,16 @@ impl Projector {
 
         // Means in f64; the loops are vectorised by the compiler.
         let (m, k) = (&self.world_to_camera, &self.camera.k);
+        let mut means = [[0.0f32; LANES]; 3];
+        for i in 0..3 {
+            mean[i].store(&mut means[i]);
+        }
         let mut centre = [[0.0f64; LANES]; 2];
         let (mut depth, mut inverse, mut ray) = ([0.0f32; LANES], [0.0f32; LANES], [[0.0f32; LANES]; 2]);
         for l in 0..LANES {
-            let x = f64::from(rows[0][l]) - self.centre.x;
-            let y = f64::from(rows[1][l]) - self.centre.y;
-            let z = f64::from(rows[2][l]) - self.centre.z;
+            let x = f64::from(means[0][l]) - self.centre.x;
+            let y = f64::from(means[1][l]) - self.centre.y;
+            let z = f64::from(means[2][l]) - self.centre.z;
             let px = m.x_axis.x * x + m.y_axis.x * y + m.z_axis.x * z;
             let py = m.x_axis.y * x + m.y_axis.y * y + m.z_axis.y * z;
             let pz = m.x_axis.z * x + m.y_axis.z * y + m.z_axis.z * z;
@@ -589,7 +715,6 @@ impl Projector {
             }
         }
         let (du, dv) = (s.load(&offset[0]), s.load(&offset[1]));
-        let colour = [rows[11], rows[12], rows[13]];
         cx.mul_add(du, dy * dv).store(&mut rows[0]);
         cx.store(&mut rows[1]);
         dy.store(&mut rows[2]);
@@ -597,7 +722,9 @@ impl Projector {
         ar.store(&mut rows[4]);
         (zero - log2).store(&mut rows[5]);
         rows[6] = depth;
-        rows[7..10].copy_from_slice(&colour);
+        for i in 0..3 {
+            colour[i].store(&mut rows[7 + i]);
+        }
         for l in 0..LANES {
             rows[10][l] = f32::from_bits(first + l as u32);
         }
@@ -642,14 +769,14 @@ struct Covariance {
 }
 
 /// Pixels `lo..hi` of `0..size` whose centres lie within `half` of `centre`; `None` when empty.
-fn pixel_span(centre: f64, half: f64, size: u32) -> Option<(u16, u16)> {
+fn pixel_span(centre: f64, half: f64, size: u32) -> Option<[u16; 2]> {
     if centre.is_nan() || half.is_nan() {
         return None;
     }
     // Size <= 16384 fits.
     let lo = (centre - half - 0.5).ceil().max(0.0);
     let hi = (centre + half - 0.5).floor().min(f64::from(size) - 1.0);
-    (lo <= hi).then(|| (lo as u16, hi as u16 + 1))
+    (lo <= hi).then(|| [lo as u16, hi as u16 + 1])
 }
 
 #[cfg(test)]
@@ -659,11 +786,11 @@ mod tests {
 
     #[test]
     fn spans_hold_exactly_the_pixel_centres_inside() {
-        assert_eq!(pixel_span(4.5, 0.0, 8), Some((4, 5)));
+        assert_eq!(pixel_span(4.5, 0.0, 8), Some([4, 5]));
         assert_eq!(pixel_span(4.4, 0.05, 8), None);
-        assert_eq!(pixel_span(0.0, 1e30, 8), Some((0, 8)));
+        assert_eq!(pixel_span(0.0, 1e30, 8), Some([0, 8]));
         assert_eq!(pixel_span(-3.0, 3.4, 8), None);
-        assert_eq!(pixel_span(-3.0, 3.5, 8), Some((0, 1)));
+        assert_eq!(pixel_span(-3.0, 3.5, 8), Some([0, 1]));
         assert_eq!(pixel_span(f64::NAN, 1.0, 8), None);
         assert_eq!(pixel_span(3.0, f64::NAN, 8), None);
     }
@@ -690,10 +817,10 @@ mod tests {
         assert_eq!((r.z, r.nlo), (4.0, 0.0));
         assert!((r.cx - unit).abs() < 1e-7 && (r.ar - unit).abs() < 1e-7 && r.dy.abs() < 1e-7);
         assert!(
-            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6 && (r.e - unit * (f32::from(r.y.0) + 0.5 - 24.0)).abs() < 1e-6
+            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6 && (r.e - unit * (f32::from(r.y[0]) + 0.5 - 24.0)).abs() < 1e-6
         );
         // Radius sqrt(2 ln 255) * sqrt(25.3) = 16.74 pixels: centres 15.5..=48.5.
-        assert_eq!(r.x, (15, 49));
+        assert_eq!(r.x, [15, 49]);
         assert_eq!(counts, Counts::default());
     }
 }

@@ -10,6 +10,7 @@ use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
 use sf_ops::Kernels;
 use sf_ops::par::Pool;
+use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::backward::{Back, Drawn};
 use crate::bin::{self, GROUPS, Group, KeyForm};
@@ -236,10 +237,10 @@ impl Renderer {
         out.resize(camera.width as usize, camera.height as usize, extra.channels)?;
         out.stats = stats;
         let form = KeyForm::of(scene.len());
-        let groups = &self.groups;
-        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(g, form, (columns, rows)));
+        let (groups, kernels) = (&self.groups, self.kernels);
+        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(kernels, g, form, (columns, rows)));
         let groups: [_; GROUPS] = std::array::from_fn(|g| read(&groups[g]));
-        let records = std::array::from_fn(|g| &groups[g].records[..]);
+        let records = std::array::from_fn(|g| groups[g].seen.records());
         let shared = Shared { records, form, a_max: settings.a_max, extra };
         out.stats.block_updates = self.blend(columns as usize, &groups, &shared, options.background, out);
         drop(groups);
@@ -261,7 +262,7 @@ impl Renderer {
         for group in &self.groups {
             let group = read(group);
             counts.add(&group.counts);
-            stats.visible += group.records.len() as u64;
+            stats.visible += group.seen.records().len() as u64;
             stats.entries += group.entries;
         }
         Stats {
@@ -315,7 +316,8 @@ impl Renderer {
             let lists = std::array::from_fn(|g| groups[g].tile(t));
             self.kernels.enter(Blend { tile: &mut tile, lists, place, shared });
             updates.fetch_add(tile.updates(), Relaxed);
-            lock(&bands[t / columns]).store(&tile, place, (width, channels), background);
+            let band = &mut *lock(&bands[t / columns]);
+            self.kernels.enter(Store { band, tile: &tile, place, width, channels, background });
         });
         updates.into_inner()
     }
@@ -339,30 +341,72 @@ struct Band<'a> {
     extra: &'a mut [f32],
 }
 
-impl Band<'_> {
-    fn store(&mut self, tile: &Tile, place: Place, (width, channels): (usize, usize), background: [f32; 3]) {
-        for y in 0..place.height {
-            let start = y * width + place.x;
-            let pixels = start..start + place.width;
-            let rgb = self.rgb[3 * pixels.start..3 * pixels.end].chunks_mut(3 * BLOCK);
-            let depth = self.depth[pixels.clone()].chunks_mut(BLOCK);
-            let alpha = self.alpha[pixels.clone()].chunks_mut(BLOCK);
-            for (column, ((rgb, depth), alpha)) in rgb.zip(depth).zip(alpha).enumerate() {
-                let (t, [r, g, b, z]) = tile.four(column, y);
-                for (x, out) in rgb.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                    *out = [r[x] + t[x] * background[0], g[x] + t[x] * background[1], b[x] + t[x] * background[2]];
-                }
-                depth.copy_from_slice(&z[..depth.len()]);
-                for (out, t) in alpha.iter_mut().zip(t) {
-                    *out = 1.0 - t;
+/// Writes a tile to its columns of a band, sixteen pixels at a time.
+struct Store<'a, 'b> {
+    band: &'a mut Band<'b>,
+    tile: &'a Tile,
+    place: Place,
+    /// Columns of the image.
+    width: usize,
+    channels: usize,
+    background: [f32; 3],
+}
+
+impl Body for Store<'_, '_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let Store { band, tile, place, width, channels, background } = self;
+        let one = s.splat(1.0);
+        let background = [s.splat(background[0]), s.splat(background[1]), s.splat(background[2])];
+        for x in (0..place.width).step_by(LANES) {
+            let columns = LANES.min(place.width - x);
+            for y in (0..place.height).step_by(BLOCK) {
+                let [t, sums @ ..] = tile.rows(s, x / BLOCK, y / BLOCK);
+                let [r, g, b, z] = sums;
+                for row in 0..BLOCK.min(place.height - y) {
+                    let start = (y + row) * width + place.x + x;
+                    let t = t[row].abs();
+                    let rgb = [r[row] + t * background[0], g[row] + t * background[1], b[row] + t * background[2]];
+                    // Whole vectors where they fit, so that nothing goes through other memory.
+                    let to = &mut band.rgb[3 * start..3 * (start + columns)].as_chunks_mut().0;
+                    match <&mut [[f32; 3]; LANES]>::try_from(&mut **to) {
+                        Ok(to) => s.store3(rgb, to),
+                        Err(_) => {
+                            let mut part = [[0.0; 3]; LANES];
+                            s.store3(rgb, &mut part);
+                            to.copy_from_slice(&part[..columns]);
+                        }
+                    }
+                    let depth = &mut band.depth[start..start + columns];
+                    let alpha = &mut band.alpha[start..start + columns];
+                    store(z[row], depth);
+                    store(one - t, alpha);
                 }
             }
-            if channels > 0 {
-                let rows = self.extra[pixels.start * channels..pixels.end * channels].chunks_exact_mut(channels);
+        }
+        if channels > 0 {
+            for y in 0..place.height {
+                let start = y * width + place.x;
+                let rows = band.extra[start * channels..(start + place.width) * channels].chunks_exact_mut(channels);
                 for (x, out) in rows.enumerate() {
                     out.iter_mut().zip(tile.extra(x, y, channels)).for_each(|(v, sum)| *v = sum);
                 }
             }
+        }
+    }
+}
+
+/// The first lanes to a slice of up to sixteen.
+#[inline(always)]
+fn store<V: Vector>(v: V, to: &mut [f32]) {
+    match <&mut [f32; LANES]>::try_from(&mut *to) {
+        Ok(to) => v.store(to),
+        Err(_) => {
+            let mut part = [0.0; LANES];
+            v.store(&mut part);
+            to.copy_from_slice(&part[..to.len()]);
         }
     }
 }

@@ -28,6 +28,7 @@ impl Avx2 {
 // the bounds, and the loads and stores are unaligned ones.
 impl Simd for Avx2 {
     type V = V;
+    const REGISTERS: usize = 8;
 
     #[inline(always)]
     fn splat(self, x: f32) -> V {
@@ -56,6 +57,20 @@ impl Simd for Avx2 {
         unsafe {
             let p = x.as_ptr().cast::<__m256i>();
             V(_mm256_cvtepi32_ps(_mm256_loadu_si256(p)), _mm256_cvtepi32_ps(_mm256_loadu_si256(p.add(1))))
+        }
+    }
+
+    #[inline(always)]
+    fn transpose_quads(self, v: [V; 4]) -> [V; 4] {
+        let [a, b, c, d] = v;
+        // SAFETY: the token proves avx2.
+        unsafe {
+            [
+                V(_mm256_permute2f128_ps::<0x20>(a.0, b.0), _mm256_permute2f128_ps::<0x20>(c.0, d.0)),
+                V(_mm256_permute2f128_ps::<0x31>(a.0, b.0), _mm256_permute2f128_ps::<0x31>(c.0, d.0)),
+                V(_mm256_permute2f128_ps::<0x20>(a.1, b.1), _mm256_permute2f128_ps::<0x20>(c.1, d.1)),
+                V(_mm256_permute2f128_ps::<0x31>(a.1, b.1), _mm256_permute2f128_ps::<0x31>(c.1, d.1)),
+            ]
         }
     }
 
@@ -188,6 +203,12 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn neg_mul_add(self, a: V, b: V) -> V {
+        // SAFETY: the vector proves fma.
+        unsafe { V(_mm256_fnmadd_ps(self.0, a.0, b.0), _mm256_fnmadd_ps(self.1, a.1, b.1)) }
+    }
+
+    #[inline(always)]
     fn max(self, o: V) -> V {
         // SAFETY: the vector proves avx2. maxps is exactly a > b ? a : b.
         unsafe { V(_mm256_max_ps(self.0, o.0), _mm256_max_ps(self.1, o.1)) }
@@ -231,6 +252,27 @@ impl Vector for V {
         unsafe {
             let sign = _mm256_set1_ps(-0.0);
             V(_mm256_andnot_ps(sign, self.0), _mm256_andnot_ps(sign, self.1))
+        }
+    }
+
+    #[inline(always)]
+    fn minus_abs(self) -> V {
+        // SAFETY: the vector proves avx2.
+        unsafe {
+            let sign = _mm256_set1_ps(-0.0);
+            V(_mm256_or_ps(sign, self.0), _mm256_or_ps(sign, self.1))
+        }
+    }
+
+    #[inline(always)]
+    fn times_pow2_of_low_bits(self, n: V) -> V {
+        // SAFETY: the vectors prove avx2.
+        unsafe {
+            let lo = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.0));
+            let hi = _mm256_slli_epi32::<23>(_mm256_castps_si256(n.1));
+            let lo = _mm256_add_epi32(_mm256_castps_si256(self.0), lo);
+            let hi = _mm256_add_epi32(_mm256_castps_si256(self.1), hi);
+            V(_mm256_castsi256_ps(lo), _mm256_castsi256_ps(hi))
         }
     }
 

@@ -30,6 +30,8 @@ pub const LANES: usize = 16;
 pub trait Simd: Copy {
     /// Its vectors.
     type V: Vector;
+    /// How many vectors the registers hold.
+    const REGISTERS: usize;
     /// Every lane `x`.
     fn splat(self, x: f32) -> Self::V;
     /// Lane i from `x[i]`.
@@ -38,6 +40,65 @@ pub trait Simd: Copy {
     fn load_f16(self, x: &[u16; LANES]) -> Self::V;
     /// Lane i from the integer `x[i]`, rounded to nearest, ties to even.
     fn load_i32(self, x: &[i32; LANES]) -> Self::V;
+    /// Vector c, lane i from `x[i][c]`.
+    #[inline(always)]
+    fn load3(self, x: &[[f32; 3]; LANES]) -> [Self::V; 3] {
+        std::array::from_fn(|c| {
+            let mut lanes = [0.0; LANES];
+            for i in 0..LANES {
+                lanes[i] = x[i][c];
+            }
+            self.load(&lanes)
+        })
+    }
+    /// Vector c, lane i from `x[i][c]`.
+    #[inline(always)]
+    fn load4(self, x: &[[f32; 4]; LANES]) -> [Self::V; 4] {
+        std::array::from_fn(|c| {
+            let mut lanes = [0.0; LANES];
+            for i in 0..LANES {
+                lanes[i] = x[i][c];
+            }
+            self.load(&lanes)
+        })
+    }
+    /// Vector c, lane i to `x[i][c]`.
+    #[inline(always)]
+    fn store3(self, v: [Self::V; 3], x: &mut [[f32; 3]; LANES]) {
+        for (c, v) in v.into_iter().enumerate() {
+            let mut lanes = [0.0; LANES];
+            v.store(&mut lanes);
+            for i in 0..LANES {
+                x[i][c] = lanes[i];
+            }
+        }
+    }
+    /// The lanes of v whose bits are set in `lanes`, in order, to the front of `x`; what follows them in `x` is unspecified.
+    #[inline(always)]
+    fn store_chosen(self, v: Self::V, lanes: u16, x: &mut [f32; LANES]) {
+        let mut all = [0.0; LANES];
+        v.store(&mut all);
+        let mut n = 0;
+        for l in 0..LANES {
+            x[n % LANES] = all[l];
+            n += usize::from(lanes >> l & 1);
+        }
+    }
+    /// Swaps rows and columns of four lanes each: four lanes from `4 j` on of result i are those from `4 i` on of `x[j]`.
+    #[inline(always)]
+    fn transpose_quads(self, v: [Self::V; 4]) -> [Self::V; 4] {
+        let mut x = [[0.0; LANES]; 4];
+        for (v, x) in v.into_iter().zip(&mut x) {
+            v.store(x);
+        }
+        std::array::from_fn(|i| {
+            let mut lanes = [0.0; LANES];
+            for j in 0..4 {
+                lanes[4 * j..4 * j + 4].copy_from_slice(&x[j][4 * i..4 * i + 4]);
+            }
+            self.load(&lanes)
+        })
+    }
     /// Swaps rows and columns.
     #[inline(always)]
     fn transpose(self, x: &mut [[f32; LANES]; LANES]) {
@@ -57,6 +118,11 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn store(self, x: &mut [f32; LANES]);
     /// self * a + b, rounded once.
     fn mul_add(self, a: Self, b: Self) -> Self;
+    /// b - self * a, rounded once.
+    #[inline(always)]
+    fn neg_mul_add(self, a: Self, b: Self) -> Self {
+        self.negate(u16::MAX).mul_add(a, b)
+    }
     /// self > other ? self : other; a NaN on either side gives `other`.
     fn max(self, other: Self) -> Self;
     /// self < other ? self : other; a NaN on either side gives `other`.
@@ -67,12 +133,19 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn gt_bits(self, other: Self) -> u16;
     /// Clears the sign bit.
     fn abs(self) -> Self;
+    /// Sets the sign bit.
+    #[inline(always)]
+    fn minus_abs(self) -> Self {
+        self.abs().negate(u16::MAX)
+    }
     /// IEEE square root; NaN below zero.
     fn sqrt(self) -> Self;
     /// (bits(self) << 23) + (`bias` << 23) as float: 2^(n + bias - 127) when the low bits of self hold n.
     fn pow2_of_low_bits(self, bias: i32) -> Self;
     /// Sum of the bits of the lanes as integers, modulo 2^32.
     fn add_bits(self, other: Self) -> Self;
+    /// bits(self) + (bits(n) << 23) as float: self 2^n where the low bits of n hold the integer n, self is normal and the result too.
+    fn times_pow2_of_low_bits(self, n: Self) -> Self;
     /// Flips the sign of lane i where bit i of `lanes` is set; also of zeros.
     fn negate(self, lanes: u16) -> Self;
     /// Lane i takes lane i ^ H, for H = 1, 2, 4, 8.

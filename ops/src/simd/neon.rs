@@ -34,6 +34,7 @@ macro_rules! each {
 // Every SAFETY line below: the token, or the vector made from it, proves neon; array references give the bounds.
 impl Simd for Neon {
     type V = V;
+    const REGISTERS: usize = 8;
 
     #[inline(always)]
     fn splat(self, x: f32) -> V {
@@ -55,6 +56,17 @@ impl Simd for Neon {
         unsafe {
             V([widen(vld1_u16(p)), widen(vld1_u16(p.add(4))), widen(vld1_u16(p.add(8))), widen(vld1_u16(p.add(12)))])
         }
+    }
+
+    #[inline(always)]
+    fn transpose_quads(self, v: [V; 4]) -> [V; 4] {
+        let [V(a), V(b), V(c), V(d)] = v;
+        [
+            V([a[0], b[0], c[0], d[0]]),
+            V([a[1], b[1], c[1], d[1]]),
+            V([a[2], b[2], c[2], d[2]]),
+            V([a[3], b[3], c[3], d[3]]),
+        ]
     }
 
     #[inline(always)]
@@ -215,6 +227,33 @@ impl Vector for V {
     fn abs(self) -> V {
         // SAFETY: the vector proves neon.
         unsafe { V([vabsq_f32(self.0[0]), vabsq_f32(self.0[1]), vabsq_f32(self.0[2]), vabsq_f32(self.0[3])]) }
+    }
+
+    #[inline(always)]
+    fn neg_mul_add(self, a: V, b: V) -> V {
+        let (x, a, b) = (self.0, a.0, b.0);
+        // SAFETY: the vector proves neon.
+        unsafe {
+            V([
+                vfmsq_f32(b[0], x[0], a[0]),
+                vfmsq_f32(b[1], x[1], a[1]),
+                vfmsq_f32(b[2], x[2], a[2]),
+                vfmsq_f32(b[3], x[3], a[3]),
+            ])
+        }
+    }
+
+    #[inline(always)]
+    fn times_pow2_of_low_bits(self, n: V) -> V {
+        let mut y = self.0;
+        // SAFETY: the vectors prove neon.
+        unsafe {
+            for (r, n) in y.iter_mut().zip(n.0) {
+                let shifted = vshlq_n_s32::<23>(vreinterpretq_s32_f32(n));
+                *r = vreinterpretq_f32_s32(vaddq_s32(vreinterpretq_s32_f32(*r), shifted));
+            }
+        }
+        V(y)
     }
 
     #[inline(always)]

@@ -22,6 +22,8 @@ impl Scalar {
 
 impl Simd for Scalar {
     type V = Lanes;
+    // The compiler's registers, whatever they are.
+    const REGISTERS: usize = 8;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Lanes {
@@ -125,6 +127,11 @@ impl Vector for Lanes {
     }
 
     #[inline(always)]
+    fn times_pow2_of_low_bits(self, n: Lanes) -> Lanes {
+        self.zip(n, |x, n| f32::from_bits(x.to_bits().wrapping_add(n.to_bits() << 23)))
+    }
+
+    #[inline(always)]
     fn pow2_of_low_bits(self, bias: i32) -> Lanes {
         Lanes(self.0.map(|x| f32::from_bits((x.to_bits() << 23).wrapping_add((bias as u32) << 23))))
     }
@@ -179,6 +186,7 @@ impl Lane {
 
 impl Simd for Single {
     type V = Lane;
+    const REGISTERS: usize = 8;
 
     #[inline(always)]
     fn splat(self, x: f32) -> Lane {
@@ -272,6 +280,11 @@ impl Vector for Lane {
     #[inline(always)]
     fn sqrt(self) -> Lane {
         Lane(self.0.sqrt())
+    }
+
+    #[inline(always)]
+    fn times_pow2_of_low_bits(self, n: Lane) -> Lane {
+        Lane(f32::from_bits(self.0.to_bits().wrapping_add(n.0.to_bits() << 23)))
     }
 
     #[inline(always)]
