@@ -108,10 +108,10 @@ impl Renderer {
         let mut next = 0u32;
         for (group, first) in groups.iter().zip(first_slot.iter_mut()) {
             first.clear();
-            for tiles in group.seen.tiles() {
+            for (_, met) in group.seen.places() {
                 first.push(next);
                 // The sum over all is limited when the image is drawn.
-                next += tiles;
+                next += met.count();
             }
         }
         slots.clear();

@@ -13,7 +13,7 @@ use sf_formats::scene::Gaussians;
 use sf_ops::Kernels;
 use sf_ops::simd::{Body, Simd};
 
-use crate::project::{Counts, Project, Projector, Rect, Seen, TILE};
+use crate::project::{Counts, Project, Projector, Rect, Seen};
 
 /// Number of runs the scene is cut into. Fixed, not the number of threads.
 pub const GROUPS: usize = 16;
@@ -97,66 +97,14 @@ pub struct Group {
     keys: Vec<u64>,
 }
 
-/// Records whose tiles are found together: a loop over an array, which the compiler makes vectors of.
-const BATCH: usize = 64;
-
-/// Tiles that records meet.
-struct Met {
-    /// The first.
-    tile: [u32; BATCH],
-    /// Further columns and rows of tiles, `columns | rows << 16`.
-    more: [u32; BATCH],
-    /// The rectangle of blocks, each axis modulo a tile: of a record in one tile, its rectangle.
-    rect: [u32; BATCH],
-}
-
-impl Met {
-    /// Of up to [`BATCH`] records, from the bits of their columns and rows.
-    #[inline(always)]
-    fn new(x: &[f32], y: &[f32], columns: u32) -> Met {
-        let mut met = Met { tile: [0; BATCH], more: [0; BATCH], rect: [0; BATCH] };
-        for (i, (x, y)) in x.iter().zip(y).enumerate().take(BATCH) {
-            let (x, y) = (x.to_bits(), y.to_bits());
-            let (x0, x1) = (x & 0xffff, (x >> 16) - 1);
-            let (y0, y1) = (y & 0xffff, (y >> 16) - 1);
-            met.tile[i] = y0 / TILE * columns + x0 / TILE;
-            met.more[i] = (x1 / TILE - x0 / TILE) | (y1 / TILE - y0 / TILE) << 16;
-            met.rect[i] = (x0 >> 2 & 7) | (x1 >> 2 & 7) << 3 | (y0 >> 2 & 7) << 6 | (y1 >> 2 & 7) << 9;
-        }
-        met
-    }
-
-    /// Calls `f` with the number of every tile that record `i` meets and the bits of its rectangle there.
-    #[inline(always)]
-    fn each(&self, i: usize, columns: u32, mut f: impl FnMut(usize, u32)) {
-        let (tile, more, rect) = (self.tile[i], self.more[i], self.rect[i]);
-        if more == 0 {
-            return f(tile as usize, rect);
-        }
-        let (wide, high) = (more & 0xffff, more >> 16);
-        // From the first block in the first tile, from 0 in the others; to the last block in the last, to 7 before.
-        let span = |n: u32, last: u32, bits: u32| {
-            let lo = if n == 0 { bits & 7 } else { 0 };
-            let hi = if n == last { bits >> 3 & 7 } else { 7 };
-            lo | hi << 3
-        };
-        for row in 0..=high {
-            let rows = span(row, high, rect >> 6) << 6;
-            for column in 0..=wide {
-                f((tile + row * columns + column) as usize, rows | span(column, wide, rect));
-            }
-        }
-    }
-}
-
-/// Counts the keys of a group's records per tile and scatters them.
+/// Scatters the keys of a group's records to their tiles.
 struct Scatter<'a> {
     seen: &'a Seen,
     group: usize,
     form: KeyForm,
     /// Columns of tiles.
     columns: u32,
-    /// All 0; one more than tiles.
+    /// Where the keys of every tile go; moved to their ends.
     starts: &'a mut [u32],
     /// Room for all.
     keys: &'a mut [u64],
@@ -179,61 +127,49 @@ impl Scatter<'_> {
     #[inline(always)]
     fn scatter(self, form: KeyForm) {
         let Scatter { seen, group, columns, starts, keys, .. } = self;
-        let (z, x, y) = seen.places();
-        let batches = || z.chunks(BATCH).zip(x.chunks(BATCH)).zip(y.chunks(BATCH));
-        for ((z, x), y) in batches() {
-            let met = Met::new(x, y, columns);
-            for i in 0..z.len().min(BATCH) {
-                met.each(i, columns, |t, _| starts[t + 1] += 1);
-            }
+        for (i, (z, met)) in seen.places().enumerate() {
+            met.each(columns, |t, rect| {
+                keys[starts[t] as usize] = form.pack(z, group, i, rect);
+                starts[t] += 1;
+            });
         }
-        for t in 1..starts.len() {
-            starts[t] += starts[t - 1];
-        }
-        // Filling moves every start to its end, which is the next one's start; shifted back below.
-        for (batch, ((z, x), y)) in batches().enumerate() {
-            let met = Met::new(x, y, columns);
-            for (i, &z) in z.iter().enumerate().take(BATCH) {
-                met.each(i, columns, |t, rect| {
-                    keys[starts[t] as usize] = form.pack(z, group, batch * BATCH + i, rect);
-                    starts[t] += 1;
-                });
-            }
-        }
-        starts.copy_within(..starts.len() - 1, 1);
-        starts[0] = 0;
     }
 }
 
 impl Group {
-    /// Projects a run of the scene. `usable(i)` is a further test of a visible Gaussian `i`; those that fail
-    /// it count as not finite.
+    /// Projects a run of the scene for an image of `tiles` (columns, rows) and counts the records of every tile, up to `limit` pairs.
+    /// `usable(i)` is a further test of a visible Gaussian `i`; those that fail it count as not finite.
     pub fn project(
         &mut self,
         kernels: &Kernels,
         projector: &Projector,
-        scene: &Gaussians,
-        run: std::ops::Range<usize>,
+        (scene, run): (&Gaussians, std::ops::Range<usize>),
         usable: Option<&(dyn Fn(usize) -> bool + Sync)>,
+        (tiles, limit): ((u32, u32), u64),
     ) {
         self.counts = Counts::default();
-        let (seen, counts) = (&mut self.seen, &mut self.counts);
-        self.entries = kernels.enter(Project { projector, scene, run, usable, seen, counts });
+        // The counts lie two places on, so that their sums are starts and, once filling has moved these to the ends, starts again.
+        self.starts.clear();
+        self.starts.resize(tiles.0 as usize * tiles.1 as usize + 2, 0);
+        let (seen, counts, met) = (&mut self.seen, &mut self.counts, &mut self.starts[2..]);
+        self.entries =
+            kernels.enter(Project { projector, scene, run, usable, seen, counts, columns: tiles.0, met, limit });
     }
 
-    /// Scatters the keys of the records to the tiles of an image of `tiles` (columns, rows).
+    /// Scatters the keys of the records to the tiles of an image with `columns` tiles a row, after [`Group::project`] within the limit.
     ///
     /// Panics if there are 2^32 entries or more; the caller has a lower limit.
-    pub fn bin(&mut self, kernels: &Kernels, group: usize, form: KeyForm, tiles: (u32, u32)) {
+    pub fn bin(&mut self, kernels: &Kernels, group: usize, form: KeyForm, columns: u32) {
         let entries = u32::try_from(self.entries).expect("fewer than 2^32 entries") as usize;
-        self.starts.clear();
-        self.starts.resize(tiles.0 as usize * tiles.1 as usize + 1, 0);
+        for t in 2..self.starts.len() {
+            self.starts[t] += self.starts[t - 1];
+        }
         // Every key is written: what is left of another image needs no clearing.
         if self.keys.len() < entries {
             self.keys.resize(entries, 0);
         }
-        let (starts, keys) = (&mut self.starts[..], &mut self.keys[..entries]);
-        kernels.enter(Scatter { seen: &self.seen, group, form, columns: tiles.0, starts, keys });
+        let (starts, keys) = (&mut self.starts[1..], &mut self.keys[..entries]);
+        kernels.enter(Scatter { seen: &self.seen, group, form, columns, starts, keys });
     }
 
     /// The keys of one tile, unsorted.

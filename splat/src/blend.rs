@@ -34,7 +34,7 @@ pub(crate) const CHUNK: usize = 256;
 /// Entries between the second hint for a record and its use.
 const AHEAD: usize = 16;
 /// Most depth buckets of a list.
-const BUCKETS: usize = 1024;
+const BUCKETS: usize = 4096;
 
 /// Column of a lane in its block.
 const LANE_X: [f32; LANES] = [0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3., 0., 1., 2., 3.];
@@ -208,14 +208,16 @@ impl Draw for Composite {
     }
 }
 
-/// Sorts the keys of one bucket: some ten, rarely many, no two equal. `spare` is as long.
+/// Sorts the first `len` keys, those of one bucket: a few, rarely many, no two equal. `keys` has room for [`RANKED`] more.
 ///
-/// Many are split by depth once more. Every step but the last keeps the order of keys of one depth, which is that of their indices.
+/// Many are split by depth once more.
 #[inline(always)]
-fn sort(form: KeyForm, keys: &mut [u64], spare: &mut [u64]) {
-    if keys.len() <= RANKED {
-        return sort_few(keys);
+fn sort(form: KeyForm, keys: &mut [u64], len: usize, spare: &mut [u64]) {
+    if len <= RANKED {
+        return sort_few(keys, len);
     }
+    let (all, spare) = (keys, &mut spare[..len]);
+    let keys = &mut all[..len];
     let (mut least, mut most) = (u64::MAX, 0);
     for &key in &*keys {
         least = least.min(key);
@@ -241,9 +243,9 @@ fn sort(form: KeyForm, keys: &mut [u64], spare: &mut [u64]) {
     keys.copy_from_slice(spare);
     let mut start = 0;
     for &end in &starts[..FEWER_BUCKETS] {
-        let few = &mut keys[start..end as usize];
-        start = end as usize;
-        if few.len() <= RANKED { sort_few(few) } else { few.sort_unstable() }
+        let (few, end) = (start, end as usize);
+        start = end;
+        if end - few <= RANKED { sort_few(&mut all[few..], end - few) } else { all[few..end].sort_unstable() }
     }
 }
 
@@ -252,34 +254,35 @@ const RANKED: usize = 32;
 /// Buckets of a bucket.
 const FEWER_BUCKETS: usize = 256;
 
-/// Sorts up to [`RANKED`] keys.
+/// Sorts the first `len` keys, at most [`RANKED`] of as many or more.
 #[inline(always)]
-fn sort_few(keys: &mut [u64]) {
-    match keys.len() {
+fn sort_few(keys: &mut [u64], len: usize) {
+    match len {
         0 | 1 => (),
-        2..=8 => rank::<8>(keys),
-        9..=16 => rank::<16>(keys),
-        _ => rank::<32>(keys),
+        2..=8 => rank::<8>(keys, len),
+        9..=16 => rank::<16>(keys, len),
+        _ => rank::<32>(keys, len),
     }
 }
 
-/// Sorts up to N different keys: every one goes to the place that the number of smaller ones gives. No branch depends on the keys, and
-/// the comparisons are vectors.
+/// Sorts the first `len` of N different keys: every one goes to the place that the number of smaller ones gives. No branch depends on
+/// the keys, and the comparisons are vectors.
 #[inline(always)]
-fn rank<const N: usize>(keys: &mut [u64]) {
+fn rank<const N: usize>(keys: &mut [u64], len: usize) {
+    let Some(keys) = keys.first_chunk_mut::<N>() else { unreachable!() };
     // Signed, for instruction sets that compare nothing else.
-    let mut all = [i64::MAX; N];
-    for (to, &key) in all.iter_mut().zip(&*keys) {
-        *to = (key ^ 1 << 63) as i64;
+    let mut all = [0; N];
+    for i in 0..N {
+        all[i] = (keys[i] ^ 1 << 63) as i64;
     }
     let mut ranks = [0u64; N];
-    for &key in &all[..keys.len().min(N)] {
-        for (rank, &other) in ranks.iter_mut().zip(&all) {
-            *rank += u64::from(key < other);
+    for &key in &all[..len.min(N)] {
+        for i in 0..N {
+            ranks[i] += u64::from(key < all[i]);
         }
     }
-    for (&key, &rank) in all.iter().zip(&ranks).take(keys.len()) {
-        keys[rank as usize] = key as u64 ^ 1 << 63;
+    for i in 0..len.min(N) {
+        keys[ranks[i] as usize % N] = all[i] as u64 ^ 1 << 63;
     }
 }
 
@@ -323,7 +326,7 @@ impl Tile {
                 tile.keys[kept] = key;
                 kept += usize::from(mask & tile.alive != 0);
             }
-            sort(form, &mut tile.keys[sorted..kept], &mut tile.spare[..kept - sorted]);
+            sort(form, &mut tile.keys[sorted..], kept - sorted, &mut tile.spare);
             // Records lie in index order and are wanted in depth order: nearly every one is a cache miss, so all
             // of a chunk are on their way before the first is read.
             for &key in &tile.keys[sorted..kept] {
@@ -372,8 +375,8 @@ impl Tile {
     }
 
     fn room(&mut self, entries: usize) {
-        if self.keys.len() < entries {
-            self.keys.resize(entries, 0);
+        if self.keys.len() < entries + RANKED {
+            self.keys.resize(entries + RANKED, 0);
             self.spare.resize(entries, 0);
         }
     }
@@ -398,8 +401,8 @@ impl Tile {
         let split = &mut self.keys[..len];
         let Some(range) = form.depth(most).checked_sub(form.depth(least)) else { return 0 };
         let least = form.depth(least);
-        // The shift that leaves the range just under the number of buckets: about 8 entries in each.
-        let wanted = (len / 8).next_power_of_two().clamp(1, BUCKETS);
+        // The shift that leaves the range just under the number of buckets: about 4 entries in each.
+        let wanted = (len / 4).next_power_of_two().clamp(1, BUCKETS);
         let shift = (u64::BITS - range.leading_zeros()).saturating_sub(wanted.trailing_zeros());
         let bucket = |key: u64| ((form.depth(key) - least) >> shift) as usize & (BUCKETS - 1);
         let buckets = (range >> shift) as usize + 1;

@@ -181,6 +181,55 @@ impl Spot {
     }
 }
 
+/// Tiles that a record meets, packed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Met {
+    /// Number of the first tile.
+    pub tile: u32,
+    /// `rectangle (12) | further columns of tiles (10) | further rows (10)`; the rectangle runs from the first block in the first tile
+    /// to the last block in the last.
+    pub span: u32,
+}
+
+impl Met {
+    /// From the bits `lo | hi << 16` of columns and of rows, in an image of `columns` tiles a row.
+    #[inline(always)]
+    fn new(x: u32, y: u32, columns: u32) -> Met {
+        let (x0, x1) = (x & 0xffff, (x >> 16) - 1);
+        let (y0, y1) = (y & 0xffff, (y >> 16) - 1);
+        let rect = (x0 >> 2 & 7) | (x1 >> 2 & 7) << 3 | (y0 >> 2 & 7) << 6 | (y1 >> 2 & 7) << 9;
+        let (wide, high) = (x1 / TILE - x0 / TILE, y1 / TILE - y0 / TILE);
+        Met { tile: y0 / TILE * columns + x0 / TILE, span: rect | wide << 12 | high << 22 }
+    }
+
+    /// How many.
+    #[inline(always)]
+    pub fn count(self) -> u32 {
+        ((self.span >> 12 & 0x3ff) + 1) * ((self.span >> 22) + 1)
+    }
+
+    /// Calls `f` with the number of every tile and the bits of the [`Rect`] in it.
+    #[inline(always)]
+    pub fn each(self, columns: u32, mut f: impl FnMut(usize, u32)) {
+        let Met { tile, span: rect } = self;
+        if rect >> 12 == 0 {
+            return f(tile as usize, rect);
+        }
+        let (wide, high) = (rect >> 12 & 0x3ff, rect >> 22);
+        let span = |n: u32, last: u32, bits: u32| {
+            let lo = if n == 0 { bits & 7 } else { 0 };
+            let hi = if n == last { bits >> 3 & 7 } else { 7 };
+            lo | hi << 3
+        };
+        for row in 0..=high {
+            let rows = span(row, high, rect >> 6) << 6;
+            for column in 0..=wide {
+                f((tile + row * columns + column) as usize, rows | span(column, wide, rect));
+            }
+        }
+    }
+}
+
 /// The visible Gaussians of a run, in index order; the memory is kept between images.
 ///
 /// What binning needs lies apart, packed: the records themselves are read only where they are drawn.
@@ -191,10 +240,10 @@ pub struct Seen {
     len: usize,
     /// Camera z.
     z: Vec<f32>,
-    /// The bits of `x[0] | x[1] << 16`.
-    x: Vec<f32>,
-    /// The bits of `y[0] | y[1] << 16`.
-    y: Vec<f32>,
+    /// The bits of [`Met::tile`].
+    tile: Vec<f32>,
+    /// The bits of [`Met::span`].
+    span: Vec<f32>,
 }
 
 impl Seen {
@@ -204,20 +253,11 @@ impl Seen {
         &self.records[..self.len]
     }
 
-    /// Camera z, and the bits of the columns `x[0] | x[1] << 16` and of the rows of every record.
+    /// Camera z and tiles of every record.
     #[inline(always)]
-    pub fn places(&self) -> (&[f32], &[f32], &[f32]) {
-        (&self.z[..self.len], &self.x[..self.len], &self.y[..self.len])
-    }
-
-    /// The number of tiles that every record meets.
-    pub fn tiles(&self) -> impl Iterator<Item = u32> {
-        let (_, x, y) = self.places();
-        x.iter().zip(y).map(|(&x, &y)| tiles_met(x) * tiles_met(y))
-    }
-
-    fn clear(&mut self) {
-        self.len = 0;
+    pub fn places(&self) -> impl Iterator<Item = (f32, Met)> {
+        let places = self.z[..self.len].iter().zip(&self.tile[..self.len]).zip(&self.span[..self.len]);
+        places.map(|((&z, tile), span)| (z, Met { tile: tile.to_bits(), span: span.to_bits() }))
     }
 
     /// Room for sixteen more; half as much again when it is short.
@@ -233,20 +273,26 @@ impl Seen {
     fn grow(&mut self) {
         let len = (self.len + self.len / 2).max(1024) + LANES;
         self.records.resize(len, Record::zeroed());
-        for plane in [&mut self.z, &mut self.x, &mut self.y] {
+        for plane in [&mut self.z, &mut self.tile, &mut self.span] {
             plane.resize(len, 0.0);
         }
     }
 
     /// Appends one.
-    fn push(&mut self, record: Record) {
+    fn push(&mut self, record: Record, columns: u32) {
         self.room();
         let at = self.len;
-        let pair = |p: [u16; 2]| f32::from_bits(u32::from(p[0]) | u32::from(p[1]) << 16);
+        let met = Met::new(pair(record.x), pair(record.y), columns);
         self.records[at] = record;
-        (self.z[at], self.x[at], self.y[at]) = (record.z, pair(record.x), pair(record.y));
+        self.z[at] = record.z;
+        (self.tile[at], self.span[at]) = (f32::from_bits(met.tile), f32::from_bits(met.span));
         self.len = at + 1;
     }
+}
+
+/// `lo | hi << 16`.
+fn pair([lo, hi]: [u16; 2]) -> u32 {
+    u32::from(lo) | u32::from(hi) << 16
 }
 
 /// Why a Gaussian is not drawn, or what was changed to draw it.
@@ -447,6 +493,12 @@ pub struct Project<'a> {
     pub seen: &'a mut Seen,
     /// What was dropped or clamped.
     pub counts: &'a mut Counts,
+    /// Columns of tiles.
+    pub columns: u32,
+    /// The number of records that meet every tile, 0 at first. They are counted here because a core has room for it beside the vectors.
+    pub met: &'a mut [u32],
+    /// Most pairs of record and tile: beyond it `met` is not continued.
+    pub limit: u64,
 }
 
 /// Fields of sixteen Gaussians, as the scene holds them.
@@ -464,9 +516,9 @@ impl Body for Project<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> u64 {
-        let Project { projector, scene, run, usable, seen, counts } = self;
-        seen.clear();
-        let mut entries = 0;
+        let Project { projector, scene, run, usable, seen, counts, columns, met, limit } = self;
+        seen.len = 0;
+        let mut keep = Keep { projector, scene, usable, seen, counts, columns, met, limit, entries: 0 };
         let mut rows = [[0.0; LANES]; LANES];
         let (mean, rest) = scene.mean[run.clone()].as_chunks::<LANES>();
         let (scale, _) = scene.scale[run.clone()].as_chunks::<LANES>();
@@ -477,7 +529,7 @@ impl Body for Project<'_> {
         for ((((mean, scale), quat), opacity), colour) in mean.iter().zip(scale).zip(quat).zip(opacity).zip(colour) {
             let fields = Sixteen { mean, scale, quat, opacity, colour };
             let lanes = projector.sixteen(s, &fields, &mut rows, start as u32);
-            entries += keep(s, (projector, scene, start), &mut rows, lanes, usable, seen, counts);
+            keep.append(s, start, &mut rows, lanes);
             start += LANES;
         }
         if !rest.is_empty() {
@@ -496,47 +548,78 @@ impl Body for Project<'_> {
             let valid = (u32::from(u16::MAX) >> (LANES - lanes)) as u16;
             let (easy, hard) = projector.sixteen(s, &fields, &mut rows, start as u32);
             let lanes = (easy & valid, hard & valid);
-            entries += keep(s, (projector, scene, start), &mut rows, lanes, usable, seen, counts);
+            keep.append(s, start, &mut rows, lanes);
         }
-        entries
+        keep.entries
     }
 }
 
-/// Appends the visible ones of sixteen, and returns the tiles they meet: `easy` lanes from the fields of records in `rows`, `hard` lanes by
-/// the f64 path.
-#[inline(always)]
-fn keep<S: Simd>(
-    s: S,
-    (projector, scene, start): (&Projector, &Gaussians, usize),
-    rows: &mut [[f32; LANES]; LANES],
-    (easy, hard): (u16, u16),
-    usable: Option<&(dyn Fn(usize) -> bool + Sync)>,
-    seen: &mut Seen,
-    counts: &mut Counts,
-) -> u64 {
-    if easy | hard == 0 {
-        return 0;
+/// [`Project`] at work.
+struct Keep<'a> {
+    projector: &'a Projector,
+    scene: &'a Gaussians,
+    usable: Option<&'a (dyn Fn(usize) -> bool + Sync)>,
+    seen: &'a mut Seen,
+    counts: &'a mut Counts,
+    columns: u32,
+    met: &'a mut [u32],
+    limit: u64,
+    entries: u64,
+}
+
+impl Keep<'_> {
+    /// Appends the visible ones of sixteen: `easy` lanes from the fields of records in `rows`, `hard` lanes by the f64 path.
+    #[inline(always)]
+    fn append<S: Simd>(
+        &mut self,
+        s: S,
+        start: usize,
+        rows: &mut [[f32; LANES]; LANES],
+        (easy, hard): (u16, u16),
+    ) {
+        if easy | hard == 0 {
+            return;
+        }
+        let at = self.seen.len;
+        if hard == 0 && self.usable.is_none() {
+            self.seen.room();
+            let seen = &mut *self.seen;
+            let (mut tile, mut span) = ([0.0; LANES], [0.0; LANES]);
+            for l in 0..LANES {
+                let met = Met::new(rows[X_ROW][l].to_bits(), rows[Y_ROW][l].to_bits(), self.columns);
+                (tile[l], span[l]) = (f32::from_bits(met.tile), f32::from_bits(met.span));
+            }
+            let room = at..at + LANES;
+            for (field, plane) in [(&rows[Z_ROW], &mut seen.z), (&tile, &mut seen.tile), (&span, &mut seen.span)] {
+                let to = plane[room.clone()].as_mut_array().unwrap_or_else(|| unreachable!());
+                s.store_chosen(s.load(field), easy, to);
+            }
+            s.transpose(rows);
+            // Every row is written, and the next one over it where it is not visible: no branch to guess.
+            let to: &mut [Record; LANES] = seen.records[room].as_mut_array().unwrap_or_else(|| unreachable!());
+            let mut n = 0;
+            for l in 0..LANES {
+                to[n % LANES] = bytemuck::cast(rows[l]);
+                n += usize::from(easy >> l & 1);
+            }
+            seen.len = at + n;
+        } else {
+            s.transpose(rows);
+            self.append_hard(start, rows, (easy, hard));
+        }
+        let seen = &*self.seen;
+        for (tile, span) in seen.tile[at..seen.len].iter().zip(&seen.span[at..seen.len]) {
+            let met = Met { tile: tile.to_bits(), span: span.to_bits() };
+            self.entries += u64::from(met.count());
+            if self.entries <= self.limit {
+                met.each(self.columns, |t, _| self.met[t] += 1);
+            }
+        }
     }
-    seen.room();
-    let at = seen.len;
-    let mut entries = 0;
-    if hard == 0 && usable.is_none() {
-        let room = at..at + LANES;
-        for (field, plane) in [(Z_ROW, &mut seen.z), (X_ROW, &mut seen.x), (Y_ROW, &mut seen.y)] {
-            let to = plane[room.clone()].as_mut_array().unwrap_or_else(|| unreachable!());
-            s.store_chosen(s.load(&rows[field]), easy, to);
-        }
-        s.transpose(rows);
-        // Every row is written, and the next one over it where it is not visible: no branch to guess.
-        let to: &mut [Record; LANES] = seen.records[room].as_mut_array().unwrap_or_else(|| unreachable!());
-        let mut n = 0;
-        for l in 0..LANES {
-            to[n % LANES] = bytemuck::cast(rows[l]);
-            n += usize::from(easy >> l & 1);
-        }
-        seen.len = at + n;
-    } else {
-        s.transpose(rows);
+
+    /// [`Keep::append`] one by one.
+    #[inline(never)]
+    fn append_hard(&mut self, start: usize, rows: &[[f32; LANES]; LANES], (easy, hard): (u16, u16)) {
         let mut left = easy | hard;
         while left != 0 {
             let l = left.trailing_zeros() as usize % LANES;
@@ -544,27 +627,16 @@ fn keep<S: Simd>(
             let record = if easy >> l & 1 != 0 {
                 bytemuck::cast(rows[l])
             } else {
-                let Some(record) = projector.project(scene, start + l, counts) else { continue };
+                let Some(record) = self.projector.project(self.scene, start + l, self.counts) else { continue };
                 record
             };
-            if usable.is_some_and(|usable| !usable(start + l)) {
-                counts.nonfinite += 1;
+            if self.usable.is_some_and(|usable| !usable(start + l)) {
+                self.counts.nonfinite += 1;
                 continue;
             }
-            seen.push(record);
+            self.seen.push(record, self.columns);
         }
     }
-    for (&x, &y) in seen.x[at..seen.len].iter().zip(&seen.y[at..seen.len]) {
-        entries += u64::from(tiles_met(x)) * u64::from(tiles_met(y));
-    }
-    entries
-}
-
-/// Tiles of one axis that pixels `lo..hi` meet, from the bits `lo | hi << 16`.
-#[inline(always)]
-fn tiles_met(pixels: f32) -> u32 {
-    let bits = pixels.to_bits();
-    ((bits >> 16) - 1) / TILE - (bits & 0xffff) / TILE + 1
 }
 
 /// Rows of the transposed fields of a record.

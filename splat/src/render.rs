@@ -223,7 +223,7 @@ impl Renderer {
         let columns = camera.width.div_ceil(TILE);
         let rows = camera.height.div_ceil(TILE);
         let limit = options.max_entries.min(u64::from(u32::MAX));
-        let stats = self.project(scene, &Projector::new(camera, settings), extra);
+        let stats = self.project(scene, &Projector::new(camera, settings), extra, ((columns, rows), limit));
         if stats.entries > limit {
             return Err(Error::resource(
                 "render",
@@ -238,7 +238,7 @@ impl Renderer {
         out.stats = stats;
         let form = KeyForm::of(scene.len());
         let (groups, kernels) = (&self.groups, self.kernels);
-        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(kernels, g, form, (columns, rows)));
+        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(kernels, g, form, columns));
         let groups: [_; GROUPS] = std::array::from_fn(|g| read(&groups[g]));
         let records = std::array::from_fn(|g| groups[g].seen.records());
         let shared = Shared { records, form, a_max: settings.a_max, extra };
@@ -250,12 +250,19 @@ impl Renderer {
     }
 
     /// Projects all groups and sums their counts.
-    fn project(&mut self, scene: &Gaussians, projector: &Projector, extra: Channels) -> Stats {
+    fn project(
+        &mut self,
+        scene: &Gaussians,
+        projector: &Projector,
+        extra: Channels,
+        tiles: ((u32, u32), u64),
+    ) -> Stats {
         let finite = |i: usize| extra.values[i * extra.channels..][..extra.channels].iter().all(|v| v.is_finite());
         let usable = (extra.channels > 0).then_some(&finite as &(dyn Fn(usize) -> bool + Sync));
         let (groups, kernels) = (&self.groups, self.kernels);
         self.pool.run(GROUPS, &|g, _| {
-            write(&groups[g]).project(kernels, projector, scene, bin::run(scene.len(), g), usable);
+            let part = (scene, bin::run(scene.len(), g));
+            write(&groups[g]).project(kernels, projector, part, usable, tiles);
         });
         let mut counts = Counts::default();
         let mut stats = Stats { gaussians: scene.len() as u64, ..Stats::default() };
