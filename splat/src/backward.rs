@@ -118,6 +118,8 @@ impl Renderer {
         slots.resize_with(next as usize, Slot::default);
         let shared = Shared {
             records: std::array::from_fn(|g| groups[g].seen.records()),
+            seen: std::array::from_fn(|g| &groups[g].seen),
+            columns: drawn.camera.width.div_ceil(TILE),
             form: KeyForm::of(drawn.gaussians),
             a_max: drawn.settings.a_max,
             extra: Channels { channels: 0, values: &[] },
@@ -162,9 +164,10 @@ impl Renderer {
         self.pool.run(GROUPS, &|g, _| {
             let (group, part) = (read(&self.groups[g]), &mut *lock(&parts[g]));
             let start = bin::run(scene.len(), g).start;
-            for (record, &first) in group.seen.records().iter().zip(&self.back.first_slot[g]) {
+            let records = group.seen.records().iter().zip(group.seen.places());
+            for ((record, (_, met)), &first) in records.zip(&self.back.first_slot[g]) {
                 let mut sums = [0.0f64; SUMS];
-                for slot in &self.back.slots[first as usize..][..record.spot().tiles() as usize] {
+                for slot in &self.back.slots[first as usize..][..met.count() as usize] {
                     for (sum, value) in sums.iter_mut().zip(slot) {
                         *sum += f64::from(f32::from_bits(value.load(Relaxed)));
                     }

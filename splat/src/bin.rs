@@ -57,6 +57,12 @@ impl KeyForm {
         key >> 33
     }
 
+    /// The z of a key.
+    #[inline(always)]
+    pub fn z(self, key: u64) -> f32 {
+        f32::from_bits((key >> 33) as u32)
+    }
+
     /// The group and the record that a key names.
     #[inline(always)]
     pub fn locate(self, key: u64) -> (usize, usize) {
@@ -206,6 +212,7 @@ mod tests {
             assert!(keys.windows(2).all(|k| k[0] < k[1]));
             for (key, name) in keys.iter().zip(names.iter().cycle()) {
                 assert_eq!(form.locate(*key), *name);
+                assert!([0.01, 0.011, 4.0, 1e10].contains(&form.z(*key)));
                 assert_eq!(form.blocks(*key, || rect.blocks()), rect.blocks());
             }
         }

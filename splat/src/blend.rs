@@ -20,7 +20,7 @@ use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::{self, KeyForm};
 use crate::math::exp2_neg;
-use crate::project::{BLOCK, Record, TILE, X_CUT};
+use crate::project::{BLOCK, Record, Rect, Seen, TILE, X_CUT};
 
 /// A pixel is finished when its next T would be at or below this.
 pub const T_STOP: f32 = 1e-4;
@@ -82,6 +82,14 @@ pub struct Place {
     pub width: usize,
     /// Rows inside the image, 1..=32.
     pub height: usize,
+}
+
+impl Place {
+    /// Number of the tile.
+    #[inline(always)]
+    pub(crate) fn tile(&self, columns: u32) -> u32 {
+        self.y as u32 / TILE * columns + self.x as u32 / TILE
+    }
 }
 
 /// Extra per-Gaussian values: `values[index * channels + c]`.
@@ -153,6 +161,10 @@ impl Default for Tile {
 pub struct Shared<'a> {
     /// The records of every group.
     pub records: [&'a [Record]; bin::GROUPS],
+    /// Where they lie.
+    pub seen: [&'a Seen; bin::GROUPS],
+    /// Columns of tiles.
+    pub columns: u32,
     /// How keys name them.
     pub form: KeyForm,
     /// Largest alpha.
@@ -166,6 +178,15 @@ impl Shared<'_> {
     fn record(&self, form: KeyForm, key: u64) -> &Record {
         let (group, record) = form.locate(key);
         &self.records[group][record]
+    }
+
+    /// The blocks of the tile at `place` that the record of a key meets.
+    #[inline(always)]
+    fn blocks(&self, form: KeyForm, key: u64, place: Place) -> u64 {
+        form.blocks(key, || {
+            let (group, record) = form.locate(key);
+            Rect::blocks_of(self.seen[group].met(record).rect(place.tile(self.columns), self.columns))
+        })
     }
 }
 
@@ -313,7 +334,6 @@ impl Tile {
         draw: &mut D,
     ) {
         let tile = self;
-        let first = (place.x, place.y);
         let buckets = tile.split(lists, form);
         // Kept keys move to the front of the list, in order; `dealt..kept` wait for their records.
         let (mut dealt, mut kept) = (0, 0);
@@ -322,7 +342,7 @@ impl Tile {
             let sorted = kept;
             for i in start..end {
                 let key = tile.keys[i];
-                let mask = form.blocks(key, || shared.record(form, key).blocks(first));
+                let mask = shared.blocks(form, key, place);
                 tile.keys[kept] = key;
                 kept += usize::from(mask & tile.alive != 0);
             }
@@ -437,8 +457,7 @@ impl Tile {
             // Again, for those that the first hint lost.
             prefetch(shared.record(form, self.keys[(i + AHEAD).min(keys.end - 1)]));
             let key = self.keys[i];
-            let record = shared.record(form, key);
-            self.deal(record, place, form.blocks(key, || record.blocks((place.x, place.y))));
+            self.deal(shared.record(form, key), form.z(key), place, shared.blocks(form, key, place));
         }
     }
 
@@ -449,10 +468,10 @@ impl Tile {
 
     /// Appends a Gaussian to the chunk and to the lists of the unfinished ones of `blocks`.
     #[inline(always)]
-    fn deal(&mut self, r: &Record, place: Place, blocks: u64) {
+    fn deal(&mut self, r: &Record, z: f32, place: Place, blocks: u64) {
         let chunk = &mut *self.chunk;
         let at = chunk.len % CHUNK;
-        let (x, y) = (place.x as f32 - f32::from(r.x[0]), place.y as f32 - f32::from(r.y[0]));
+        let (x, y) = (place.x as f32 - f32::from(r.first[0]), place.y as f32 - f32::from(r.first[1]));
         chunk.shown[at] = Shown {
             d: r.cx.mul_add(x, r.dy.mul_add(y, r.d)),
             cx: r.cx,
@@ -460,7 +479,7 @@ impl Tile {
             e: r.ar.mul_add(y, r.e),
             ar: r.ar,
             nlo: r.nlo,
-            value: [r.rgb[0], r.rgb[1], r.rgb[2], r.z],
+            value: [r.rgb[0], r.rgb[1], r.rgb[2], z],
             index: r.index,
         };
         chunk.len = at + 1;

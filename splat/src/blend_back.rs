@@ -22,7 +22,7 @@ use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::GROUPS;
 use crate::blend::{BLOCKS, CHUNK, Draw, Line, PER_ROW, Place, Shared, Shown, Tile, columns_rows};
-use crate::project::{BLOCK, Record, TILE};
+use crate::project::BLOCK;
 
 /// Sums of one Gaussian over pixels: h, h d, h d d, h e, h d e, h e e, then w dL/dred, w dL/dgreen, w dL/dblue, w dL/dD.
 pub(crate) const SUMS: usize = 10;
@@ -154,7 +154,7 @@ impl Draw for Write<'_> {
         history.shown.extend_from_slice(shown);
         for &key in keys {
             let (group, record) = shared.form.locate(key);
-            let slot = self.first_slot[group][record] + tile_of(&shared.records[group][record], self.place);
+            let slot = self.first_slot[group][record] + shared.seen[group].met(record).number(self.place.tile(shared.columns), shared.columns);
             history.slots.push(slot);
         }
         let mut left = tile.alive;
@@ -209,12 +209,6 @@ fn take<S: Simd>(
     }
     t.store(transmittance);
     (kept, alive)
-}
-
-/// Number of the tile in a record's box, row by row; the record meets it.
-fn tile_of(record: &Record, place: Place) -> u32 {
-    let (x, y) = record.spot().tile_box();
-    (place.y as u32 / TILE - y.0) * (x.1 - x.0) + (place.x as u32 / TILE - x.0)
 }
 
 /// What comes into the pixels of a block; 0 outside the image.

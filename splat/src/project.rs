@@ -53,33 +53,43 @@ pub const EASY_TRACE: f32 = 1e4;
 /// alone gives eps2d.
 const EASY_RATIO: f32 = 0.02;
 
-/// A visible Gaussian on the screen; one cache line.
+/// A visible Gaussian on the screen: what drawing it takes. 48 bytes, because records go through memory once on the way in and once on
+/// the way out.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
-#[repr(C, align(64))]
+#[repr(C, align(16))]
 pub struct Record {
-    /// d at the centre of pixel `(x[0], y[0])`.
+    /// d at the centre of pixel `first`.
     pub d: f32,
     /// Change of d per column.
     pub cx: f32,
     /// Change of d per row.
     pub dy: f32,
-    /// e in row `y[0]`.
+    /// e in the row of `first`.
     pub e: f32,
     /// Change of e per row.
     pub ar: f32,
     /// -log2(opacity) after antialiasing, 0..=log2(255).
     pub nlo: f32,
-    /// Camera z, the sort key and the depth.
-    pub z: f32,
     /// Colour.
     pub rgb: [f32; 3],
     /// Which Gaussian of the scene.
     pub index: u32,
+    /// Column and row of the first pixel of its box.
+    pub first: [u16; 2],
+    unused: u32,
+}
+
+/// A record and where it lies.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Projected {
+    /// The record.
+    pub record: Record,
+    /// Camera z, the sort key and the depth.
+    pub z: f32,
     /// Pixels touched: columns `x[0]..x[1]`, not empty, inside the image.
     pub x: [u16; 2],
     /// Pixels touched: rows `y[0]..y[1]`, not empty, inside the image.
     pub y: [u16; 2],
-    unused: [u32; 3],
 }
 
 /// Blocks of a tile, first and last of either axis, 0..=7.
@@ -131,56 +141,6 @@ const fn spans(apart: usize) -> [u64; 64] {
     table
 }
 
-/// Where a record lies.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Spot {
-    /// Columns `x[0]..x[1]`.
-    pub x: [u16; 2],
-    /// Rows `y[0]..y[1]`.
-    pub y: [u16; 2],
-}
-
-impl Record {
-    /// Where it lies.
-    #[inline(always)]
-    pub fn spot(&self) -> Spot {
-        Spot { x: self.x, y: self.y }
-    }
-
-    /// The blocks of the tile with first pixel `tile` that the pixel box meets; it must meet the tile.
-    #[inline(always)]
-    pub fn blocks(&self, tile: (usize, usize)) -> u64 {
-        self.spot().rect(tile).blocks()
-    }
-}
-
-impl Spot {
-    /// The blocks of the tile with first pixel `(x, y)` that the pixel box meets; it must meet the tile.
-    #[inline(always)]
-    pub fn rect(&self, (x, y): (usize, usize)) -> Rect {
-        let span = |[lo, hi]: [u16; 2], first: usize| {
-            let lo = usize::from(lo).max(first) - first;
-            let hi = (usize::from(hi) - 1 - first).min(TILE as usize - 1);
-            ((lo / BLOCK) as u8, (hi / BLOCK) as u8)
-        };
-        Rect { x: span(self.x, x), y: span(self.y, y) }
-    }
-
-    /// Number of tiles that the pixel box meets.
-    #[inline(always)]
-    pub fn tiles(&self) -> u64 {
-        let (x, y) = self.tile_box();
-        u64::from(x.1 - x.0) * u64::from(y.1 - y.0)
-    }
-
-    /// Tile columns and rows of the pixel box, half open.
-    #[inline(always)]
-    pub fn tile_box(&self) -> ((u32, u32), (u32, u32)) {
-        let span = |p: [u16; 2]| (u32::from(p[0]) / TILE, (u32::from(p[1]) - 1) / TILE + 1);
-        (span(self.x), span(self.y))
-    }
-}
-
 /// Tiles that a record meets, packed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Met {
@@ -202,32 +162,59 @@ impl Met {
         Met { tile: y0 / TILE * columns + x0 / TILE, span: rect | wide << 12 | high << 22 }
     }
 
+    /// Further columns and rows of tiles.
+    #[inline(always)]
+    fn more(self) -> (u32, u32) {
+        (self.span >> 12 & 0x3ff, self.span >> 22)
+    }
+
     /// How many.
     #[inline(always)]
     pub fn count(self) -> u32 {
-        ((self.span >> 12 & 0x3ff) + 1) * ((self.span >> 22) + 1)
+        let (wide, high) = self.more();
+        (wide + 1) * (high + 1)
+    }
+
+    /// Column and row of a tile that it meets, counted from the first.
+    fn place(self, tile: u32, columns: u32) -> (u32, u32) {
+        (tile % columns - self.tile % columns, tile / columns - self.tile / columns)
+    }
+
+    /// Number of a tile that it meets, row by row.
+    pub fn number(self, tile: u32, columns: u32) -> u32 {
+        let (column, row) = self.place(tile, columns);
+        row * (self.more().0 + 1) + column
+    }
+
+    /// The bits of the [`Rect`] in a tile that it meets.
+    pub fn rect(self, tile: u32, columns: u32) -> u32 {
+        let ((column, row), (wide, high)) = (self.place(tile, columns), self.more());
+        part(column, wide, self.span) | part(row, high, self.span >> 6) << 6
     }
 
     /// Calls `f` with the number of every tile and the bits of the [`Rect`] in it.
     #[inline(always)]
     pub fn each(self, columns: u32, mut f: impl FnMut(usize, u32)) {
-        let Met { tile, span: rect } = self;
-        if rect >> 12 == 0 {
-            return f(tile as usize, rect);
+        let Met { tile, span } = self;
+        if span >> 12 == 0 {
+            return f(tile as usize, span);
         }
-        let (wide, high) = (rect >> 12 & 0x3ff, rect >> 22);
-        let span = |n: u32, last: u32, bits: u32| {
-            let lo = if n == 0 { bits & 7 } else { 0 };
-            let hi = if n == last { bits >> 3 & 7 } else { 7 };
-            lo | hi << 3
-        };
+        let (wide, high) = self.more();
         for row in 0..=high {
-            let rows = span(row, high, rect >> 6) << 6;
+            let rows = part(row, high, span >> 6) << 6;
             for column in 0..=wide {
-                f((tile + row * columns + column) as usize, rows | span(column, wide, rect));
+                f((tile + row * columns + column) as usize, rows | part(column, wide, span));
             }
         }
     }
+}
+
+/// Blocks `lo | hi << 3` of one axis in tile `n` of `0..=last`, of which `bits` has the first in the first and the last in the last.
+#[inline(always)]
+fn part(n: u32, last: u32, bits: u32) -> u32 {
+    let lo = if n == 0 { bits & 7 } else { 0 };
+    let hi = if n == last { bits >> 3 & 7 } else { 7 };
+    lo | hi << 3
 }
 
 /// The visible Gaussians of a run, in index order; the memory is kept between images.
@@ -260,6 +247,11 @@ impl Seen {
         places.map(|((&z, tile), span)| (z, Met { tile: tile.to_bits(), span: span.to_bits() }))
     }
 
+    /// Tiles of a record.
+    pub fn met(&self, record: usize) -> Met {
+        Met { tile: self.tile[record].to_bits(), span: self.span[record].to_bits() }
+    }
+
     /// Room for sixteen more; half as much again when it is short.
     #[inline(always)]
     fn room(&mut self) {
@@ -279,12 +271,12 @@ impl Seen {
     }
 
     /// Appends one.
-    fn push(&mut self, record: Record, columns: u32) {
+    fn push(&mut self, Projected { record, z, x, y }: Projected, columns: u32) {
         self.room();
         let at = self.len;
-        let met = Met::new(pair(record.x), pair(record.y), columns);
+        let met = Met::new(pair(x), pair(y), columns);
         self.records[at] = record;
-        self.z[at] = record.z;
+        self.z[at] = z;
         (self.tile[at], self.span[at]) = (f32::from_bits(met.tile), f32::from_bits(met.span));
         self.len = at + 1;
     }
@@ -293,6 +285,11 @@ impl Seen {
 /// `lo | hi << 16`.
 fn pair([lo, hi]: [u16; 2]) -> u32 {
     u32::from(lo) | u32::from(hi) << 16
+}
+
+/// The numbers that [`pair`] packed.
+fn unpair(bits: u32) -> [u16; 2] {
+    [bits as u16, (bits >> 16) as u16]
 }
 
 /// Why a Gaussian is not drawn, or what was changed to draw it.
@@ -372,7 +369,7 @@ impl Projector {
     }
 
     /// Gaussian `i` on the screen by the f64 path; `None` when it leaves no trace in the image.
-    pub fn project(&self, scene: &Gaussians, i: usize, counts: &mut Counts) -> Option<Record> {
+    pub fn project(&self, scene: &Gaussians, i: usize, counts: &mut Counts) -> Option<Projected> {
         let (mean, scale, quat) = (scene.mean[i], scene.scale[i], scene.quat[i]);
         let (opacity, rgb) = (scene.opacity[i], scene.colour[i]);
         let finite = |v: &[f32]| v.iter().all(|x| x.is_finite());
@@ -430,20 +427,19 @@ impl Projector {
         let (cx, ar) = ((half_log2e * syy / det).sqrt(), (half_log2e / syy).sqrt());
         let dy = -cx * (sxy / syy);
         let (du, dv) = (f64::from(x[0]) + 0.5 - u, f64::from(y[0]) + 0.5 - v);
-        Some(Record {
+        let record = Record {
             d: (cx * du + dy * dv) as f32,
             cx: cx as f32,
             dy: dy as f32,
             e: (ar * dv) as f32,
             ar: ar as f32,
             nlo: (-std::f64::consts::LOG2_E * math::ln(f64::from(opacity))) as f32,
-            z,
             rgb,
             index: i as u32,
-            x,
-            y,
-            unused: [0; 3],
-        })
+            first: [x[0], y[0]],
+            unused: 0,
+        };
+        Some(Projected { record, z, x, y })
     }
 
     /// The projected covariance before the low-pass of a scale and a unit quaternion.
@@ -599,7 +595,7 @@ impl Keep<'_> {
             let to: &mut [Record; LANES] = seen.records[room].as_mut_array().unwrap_or_else(|| unreachable!());
             let mut n = 0;
             for l in 0..LANES {
-                to[n % LANES] = bytemuck::cast(rows[l]);
+                to[n % LANES] = record(&rows[l]);
                 n += usize::from(easy >> l & 1);
             }
             seen.len = at + n;
@@ -624,25 +620,36 @@ impl Keep<'_> {
         while left != 0 {
             let l = left.trailing_zeros() as usize % LANES;
             left &= left - 1;
-            let record = if easy >> l & 1 != 0 {
-                bytemuck::cast(rows[l])
+            let projected = if easy >> l & 1 != 0 {
+                let row = &rows[l];
+                let (x, y) = (unpair(row[X_ROW].to_bits()), unpair(row[Y_ROW].to_bits()));
+                Projected { record: record(row), z: row[Z_ROW], x, y }
             } else {
-                let Some(record) = self.projector.project(self.scene, start + l, self.counts) else { continue };
-                record
+                let Some(projected) = self.projector.project(self.scene, start + l, self.counts) else { continue };
+                projected
             };
             if self.usable.is_some_and(|usable| !usable(start + l)) {
                 self.counts.nonfinite += 1;
                 continue;
             }
-            self.seen.push(record, self.columns);
+            self.seen.push(projected, self.columns);
         }
     }
 }
 
-/// Rows of the transposed fields of a record.
-const Z_ROW: usize = 6;
-const X_ROW: usize = 11;
-const Y_ROW: usize = 12;
+/// The record in the first numbers of a row.
+#[inline(always)]
+fn record(row: &[f32; LANES]) -> Record {
+    let Some(first) = row.first_chunk::<12>() else { unreachable!() };
+    bytemuck::cast(*first)
+}
+
+/// Where z lies in the rows of [`Projector::sixteen`], behind the record.
+const Z_ROW: usize = 12;
+/// `lo | hi << 16` of the columns.
+const X_ROW: usize = 13;
+/// `lo | hi << 16` of the rows.
+const Y_ROW: usize = 14;
 
 impl Projector {
     /// Sixteen Gaussians to records, field by field. Returns the lanes that are visible, and those that need the f64 path.
@@ -793,15 +800,16 @@ impl Projector {
         (ar * dv).store(&mut rows[3]);
         ar.store(&mut rows[4]);
         (zero - log2).store(&mut rows[5]);
-        rows[6] = depth;
         for i in 0..3 {
-            colour[i].store(&mut rows[7 + i]);
+            colour[i].store(&mut rows[6 + i]);
         }
         for l in 0..LANES {
-            rows[10][l] = f32::from_bits(first + l as u32);
+            rows[9][l] = f32::from_bits(first + l as u32);
+            rows[10][l] = f32::from_bits(boxes[0][l].to_bits() & 0xffff | boxes[1][l].to_bits() << 16);
         }
-        rows[11] = boxes[0];
-        rows[12] = boxes[1];
+        rows[Z_ROW] = depth;
+        rows[X_ROW] = boxes[0];
+        rows[Y_ROW] = boxes[1];
         (easy, hard)
     }
 }
@@ -884,15 +892,16 @@ mod tests {
             colour: vec![[1.0, 0.0, 0.0]],
         };
         let mut counts = Counts::default();
-        let r = Projector::new(&camera, &SplatSettings::default()).project(&scene, 0, &mut counts).unwrap();
+        let p = Projector::new(&camera, &SplatSettings::default()).project(&scene, 0, &mut counts).unwrap();
+        let r = p.record;
         let unit = (0.5 * std::f64::consts::LOG2_E / 25.3).sqrt() as f32;
-        assert_eq!((r.z, r.nlo), (4.0, 0.0));
+        assert_eq!((p.z, r.nlo), (4.0, 0.0));
         assert!((r.cx - unit).abs() < 1e-7 && (r.ar - unit).abs() < 1e-7 && r.dy.abs() < 1e-7);
         assert!(
-            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6 && (r.e - unit * (f32::from(r.y[0]) + 0.5 - 24.0)).abs() < 1e-6
+            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6 && (r.e - unit * (f32::from(r.first[1]) + 0.5 - 24.0)).abs() < 1e-6
         );
         // Radius sqrt(2 ln 255) * sqrt(25.3) = 16.74 pixels: centres 15.5..=48.5.
-        assert_eq!(r.x, [15, 49]);
+        assert_eq!((p.x, r.first[0]), ([15, 49], 15));
         assert_eq!(counts, Counts::default());
     }
 }

@@ -236,12 +236,11 @@ impl Renderer {
         }
         out.resize(camera.width as usize, camera.height as usize, extra.channels)?;
         out.stats = stats;
-        let form = KeyForm::of(scene.len());
-        let (groups, kernels) = (&self.groups, self.kernels);
-        self.pool.run(GROUPS, &|g, _| write(&groups[g]).bin(kernels, g, form, columns));
+        let (groups, form) = (&self.groups, KeyForm::of(scene.len()));
         let groups: [_; GROUPS] = std::array::from_fn(|g| read(&groups[g]));
         let records = std::array::from_fn(|g| groups[g].seen.records());
-        let shared = Shared { records, form, a_max: settings.a_max, extra };
+        let seen = std::array::from_fn(|g| &groups[g].seen);
+        let shared = Shared { records, seen, columns, form, a_max: settings.a_max, extra };
         out.stats.block_updates = self.blend(columns as usize, &groups, &shared, options.background, out);
         drop(groups);
         let (background, gaussians) = (options.background, scene.len());
@@ -249,7 +248,7 @@ impl Renderer {
         Ok(())
     }
 
-    /// Projects all groups and sums their counts.
+    /// Projects and bins all groups, up to the limit, and sums their counts.
     fn project(
         &mut self,
         scene: &Gaussians,
@@ -259,10 +258,17 @@ impl Renderer {
     ) -> Stats {
         let finite = |i: usize| extra.values[i * extra.channels..][..extra.channels].iter().all(|v| v.is_finite());
         let usable = (extra.channels > 0).then_some(&finite as &(dyn Fn(usize) -> bool + Sync));
-        let (groups, kernels) = (&self.groups, self.kernels);
+        let (groups, kernels, form) = (&self.groups, self.kernels, KeyForm::of(scene.len()));
+        let ((columns, _), limit) = tiles;
+        let entries = AtomicU64::new(0);
         self.pool.run(GROUPS, &|g, _| {
             let part = (scene, bin::run(scene.len(), g));
-            write(&groups[g]).project(kernels, projector, part, usable, tiles);
+            let group = &mut *write(&groups[g]);
+            group.project(kernels, projector, part, usable, tiles);
+            // At once, while what it reads is near. Once the limit is passed nobody will look.
+            if entries.fetch_add(group.entries, Relaxed) + group.entries <= limit {
+                group.bin(kernels, g, form, columns);
+            }
         });
         let mut counts = Counts::default();
         let mut stats = Stats { gaussians: scene.len() as u64, ..Stats::default() };
