@@ -33,6 +33,8 @@ pub(crate) const BLOCKS: usize = PER_ROW * PER_ROW;
 pub(crate) const CHUNK: usize = 256;
 /// Entries between the second hint for a record and its use.
 const AHEAD: usize = 16;
+/// Keys that are filtered and sorted together at least.
+const TOGETHER: usize = 16;
 /// Most depth buckets of a list.
 const BUCKETS: usize = 4096;
 
@@ -124,8 +126,9 @@ pub struct Tile {
 struct Chunk {
     shown: [Shown; CHUNK],
     len: usize,
-    lists: [[u8; CHUNK]; BLOCKS],
-    lens: [u16; BLOCKS],
+    /// One per block, and one that is not read.
+    lists: [[u8; CHUNK]; BLOCKS + 1],
+    lens: [u16; BLOCKS + 1],
     /// Of the block that is being drawn, one per entry of its list.
     weights: [Line; CHUNK],
 }
@@ -147,8 +150,8 @@ impl Default for Tile {
             chunk: Box::new(Chunk {
                 shown: [Shown::default(); CHUNK],
                 len: 0,
-                lists: [[0; CHUNK]; BLOCKS],
-                lens: [0; BLOCKS],
+                lists: [[0; CHUNK]; BLOCKS + 1],
+                lens: [0; BLOCKS + 1],
                 weights: [Line([0.0; LANES]); CHUNK],
             }),
             updates: 0,
@@ -229,31 +232,30 @@ impl Draw for Composite {
     }
 }
 
-/// Sorts the first `len` keys, those of one bucket: a few, rarely many, no two equal. `keys` has room for [`RANKED`] more.
+/// Sorts the first `len` keys, no two equal: a few, rarely many. `keys` has room for [`RANKED`] more.
 ///
 /// Many are split by depth once more.
 #[inline(always)]
-fn sort(form: KeyForm, keys: &mut [u64], len: usize, spare: &mut [u64]) {
+fn sort(form: KeyForm, all: &mut [u64], len: usize, spare: &mut [u64]) {
     if len <= RANKED {
-        return sort_few(keys, len);
+        return sort_few(all, len);
     }
-    let (all, spare) = (keys, &mut spare[..len]);
-    let keys = &mut all[..len];
+    let (keys, spare) = (&mut all[..len], &mut spare[..len]);
     let (mut least, mut most) = (u64::MAX, 0);
     for &key in &*keys {
         least = least.min(key);
         most = most.max(key);
     }
     let (least, range) = (form.depth(least), form.depth(most) - form.depth(least));
-    // About eight in each.
-    let wanted = (keys.len() / 8).next_power_of_two().min(FEWER_BUCKETS);
-    let shift = (u64::BITS - range.leading_zeros()).saturating_sub(wanted.trailing_zeros());
+    // About sixteen in each.
+    let buckets = (len / 16).next_power_of_two().min(FEWER_BUCKETS);
+    let shift = (u64::BITS - range.leading_zeros()).saturating_sub(buckets.trailing_zeros());
     let bucket = |key: u64| ((form.depth(key) - least) >> shift) as usize % FEWER_BUCKETS;
     let mut starts = [0u32; FEWER_BUCKETS + 1];
     for &key in &*keys {
         starts[bucket(key) + 1] += 1;
     }
-    for b in 0..FEWER_BUCKETS {
+    for b in 0..buckets {
         starts[b + 1] += starts[b];
     }
     for &key in &*keys {
@@ -263,7 +265,7 @@ fn sort(form: KeyForm, keys: &mut [u64], len: usize, spare: &mut [u64]) {
     }
     keys.copy_from_slice(spare);
     let mut start = 0;
-    for &end in &starts[..FEWER_BUCKETS] {
+    for &end in &starts[..buckets] {
         let (few, end) = (start, end as usize);
         start = end;
         if end - few <= RANKED { sort_few(&mut all[few..], end - few) } else { all[few..end].sort_unstable() }
@@ -271,7 +273,7 @@ fn sort(form: KeyForm, keys: &mut [u64], len: usize, spare: &mut [u64]) {
 }
 
 /// Most keys that are sorted by their ranks.
-const RANKED: usize = 32;
+const RANKED: usize = 64;
 /// Buckets of a bucket.
 const FEWER_BUCKETS: usize = 256;
 
@@ -280,9 +282,9 @@ const FEWER_BUCKETS: usize = 256;
 fn sort_few(keys: &mut [u64], len: usize) {
     match len {
         0 | 1 => (),
-        2..=8 => rank::<8>(keys, len),
-        9..=16 => rank::<16>(keys, len),
-        _ => rank::<32>(keys, len),
+        2..=16 => rank::<16>(keys, len),
+        17..=32 => rank::<32>(keys, len),
+        _ => rank::<64>(keys, len),
     }
 }
 
@@ -337,8 +339,15 @@ impl Tile {
         let buckets = tile.split(lists, form);
         // Kept keys move to the front of the list, in order; `dealt..kept` wait for their records.
         let (mut dealt, mut kept) = (0, 0);
-        for b in 0..buckets {
-            let (start, end) = (tile.starts[b] as usize, tile.starts[b + 1] as usize);
+        let mut next = 0;
+        while next < buckets {
+            // Small buckets together: every loop has an end that the core guesses wrong.
+            let start = tile.starts[next] as usize;
+            next += 1;
+            while next < buckets && (tile.starts[next] as usize) < start + TOGETHER {
+                next += 1;
+            }
+            let end = tile.starts[next] as usize;
             let sorted = kept;
             for i in start..end {
                 let key = tile.keys[i];
@@ -463,7 +472,7 @@ impl Tile {
 
     fn empty_chunk(&mut self) {
         self.chunk.len = 0;
-        self.chunk.lens = [0; BLOCKS];
+        self.chunk.lens = [0; BLOCKS + 1];
     }
 
     /// Appends a Gaussian to the chunk and to the lists of the unfinished ones of `blocks`.
@@ -484,11 +493,18 @@ impl Tile {
         };
         chunk.len = at + 1;
         let mut left = blocks & self.alive;
-        while left != 0 {
-            let b = left.trailing_zeros() as usize % BLOCKS;
-            chunk.lists[b][usize::from(chunk.lens[b]) % CHUNK] = at as u8;
-            chunk.lens[b] += 1;
-            left &= left - 1;
+        // Four at a time, what is missing to the list that nobody reads: how many there are is a guess that often fails.
+        loop {
+            for _ in 0..4 {
+                // 64 when none is left.
+                let b = (left.trailing_zeros() as usize).min(BLOCKS);
+                chunk.lists[b][usize::from(chunk.lens[b]) % CHUNK] = at as u8;
+                chunk.lens[b] = chunk.lens[b].wrapping_add(1);
+                left &= left.wrapping_sub(1);
+            }
+            if left == 0 {
+                break;
+            }
         }
     }
 
