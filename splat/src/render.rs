@@ -10,6 +10,7 @@ use sf_formats::scene::{Gaussians, SplatSettings};
 use sf_formats::{Camera, Error, Result};
 use sf_ops::Kernels;
 use sf_ops::par::Pool;
+use sf_ops::prefetch::prefetch;
 use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::backward::{Back, Drawn};
@@ -322,10 +323,18 @@ impl Renderer {
             lock(tile).reserve(longest, channels);
         }
         let updates = AtomicU64::new(0);
-        self.pool.run(columns * rows, &|t, worker| {
+        // Neighbours in a row of tiles share a lock: each thread has its own stretch of rows, as long as all keep step.
+        let (tiles, threads) = (columns * rows, self.pool.threads());
+        let stretch = tiles.div_ceil(threads);
+        self.pool.run(stretch * threads, &|task, worker| {
+            let t = task % threads * stretch + task / threads;
+            if t >= tiles {
+                return;
+            }
             let mut tile = lock(&self.tiles[worker]);
             let place = place(t, columns, (width, height));
             tile.clear(place, channels);
+            lock(&bands[t / columns]).approach(place, width);
             let lists = std::array::from_fn(|g| groups[g].tile(t));
             self.kernels.enter(Blend { tile: &mut tile, lists, place, shared });
             updates.fetch_add(tile.updates(), Relaxed);
@@ -352,6 +361,22 @@ struct Band<'a> {
     depth: &'a mut [f32],
     alpha: &'a mut [f32],
     extra: &'a mut [f32],
+}
+
+impl Band<'_> {
+    /// Hints that the tile at `place` will be written: its rows lie on as many pages, where no hardware looks ahead.
+    fn approach(&self, place: Place, width: usize) {
+        for y in 0..place.height {
+            let start = y * width + place.x;
+            for x in (0..place.width).step_by(LANES) {
+                for i in 0..3 {
+                    prefetch(&self.rgb[3 * (start + x) + i * LANES.min(place.width - x)]);
+                }
+                prefetch(&self.depth[start + x]);
+                prefetch(&self.alpha[start + x]);
+            }
+        }
+    }
 }
 
 /// Writes a tile to its columns of a band, sixteen pixels at a time.
