@@ -11,17 +11,14 @@ use sf_ops::simd::{LANES, Simd, Vector};
 /// (1.6e-7 before rounding), 2^n by adding to the exponent of what the polynomial gave, 0.7 to 1.42.
 #[inline(always)]
 pub fn exp2_neg<S: Simd>(s: S, x: S::V) -> S::V {
-    // 1.5 * 2^23 less x holds the rounded integer in the low mantissa bits.
-    const MAGIC: f32 = 12_582_912.0;
-    let shifted = s.splat(MAGIC) - x;
-    let f = x + (shifted - s.splat(MAGIC));
+    let (f, minus_n) = x.fraction(s);
     let p = s.splat(-1.339_086_3e-3);
     let p = p.mul_add(f, s.splat(9.676_032e-3));
     let p = p.mul_add(f, s.splat(-5.550_357e-2));
     let p = p.mul_add(f, s.splat(0.240_221_07));
     let p = p.mul_add(f, s.splat(-std::f32::consts::LN_2));
     let p = p.mul_add(f, s.splat(1.0));
-    p.times_pow2_of_low_bits(shifted)
+    p.times_pow2(minus_n)
 }
 
 /// log2 of normal positive values, absolute error below 6e-7 for values in 1/255..=1.

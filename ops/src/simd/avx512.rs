@@ -327,6 +327,21 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn fraction<S: Simd<V = V>>(self, _: S) -> (V, V) {
+        // SAFETY: the vector proves avx512dq. 8: to nearest, ties to even.
+        unsafe {
+            let f = _mm512_reduce_ps::<8>(self.0);
+            (V(f), V(_mm512_sub_ps(f, self.0)))
+        }
+    }
+
+    #[inline(always)]
+    fn times_pow2(self, minus_n: V) -> V {
+        // SAFETY: the vectors prove avx512f.
+        unsafe { V(_mm512_scalef_ps(self.0, minus_n.0)) }
+    }
+
+    #[inline(always)]
     fn pow2_of_low_bits(self, bias: i32) -> V {
         // SAFETY: the vector proves avx512f.
         unsafe {

@@ -146,6 +146,19 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn add_bits(self, other: Self) -> Self;
     /// bits(self) + (bits(n) << 23) as float: self 2^n where the low bits of n hold the integer n, self is normal and the result too.
     fn times_pow2_of_low_bits(self, n: Self) -> Self;
+    /// self - n for the nearest integer n (ties to even), and something that stands for -n; |self| < 2^22.
+    #[inline(always)]
+    fn fraction<S: Simd<V = Self>>(self, s: S) -> (Self, Self) {
+        // 1.5 * 2^23 less self holds the rounded integer in the low mantissa bits.
+        let magic = s.splat(12_582_912.0);
+        let shifted = magic - self;
+        (self + (shifted - magic), shifted)
+    }
+    /// self 2^-n for the second result of [`Vector::fraction`]; self and the result are normal.
+    #[inline(always)]
+    fn times_pow2(self, minus_n: Self) -> Self {
+        self.times_pow2_of_low_bits(minus_n)
+    }
     /// Flips the sign of lane i where bit i of `lanes` is set; also of zeros.
     fn negate(self, lanes: u16) -> Self;
     /// Lane i takes lane i ^ H, for H = 1, 2, 4, 8.
