@@ -31,8 +31,6 @@ pub(crate) const PER_ROW: usize = SIDE / BLOCK;
 pub(crate) const BLOCKS: usize = PER_ROW * PER_ROW;
 /// Entries dealt out together: 12 KiB of them and at most 16 KiB of lists stay in the first-level cache.
 pub(crate) const CHUNK: usize = 256;
-/// Entries between the second hint for a record and its use.
-const AHEAD: usize = 16;
 /// Keys that are filtered and sorted together at least.
 const TOGETHER: usize = 16;
 /// Most depth buckets of a list.
@@ -181,6 +179,14 @@ impl Shared<'_> {
     fn record(&self, form: KeyForm, key: u64) -> &Record {
         let (group, record) = form.locate(key);
         &self.records[group][record]
+    }
+
+    /// Starts to bring a record near; it lies on one cache line or on two.
+    #[inline(always)]
+    fn hint(&self, form: KeyForm, key: u64) {
+        let record = self.record(form, key);
+        prefetch(&record.d);
+        prefetch(&record.first);
     }
 
     /// The blocks of the tile at `place` that the record of a key meets.
@@ -359,7 +365,7 @@ impl Tile {
             // Records lie in index order and are wanted in depth order: nearly every one is a cache miss, so all
             // of a chunk are on their way before the first is read.
             for &key in &tile.keys[sorted..kept] {
-                prefetch(shared.record(form, key));
+                shared.hint(form, key);
             }
             while kept - dealt >= CHUNK {
                 tile.deal_keys(form, place, shared, dealt..dealt + CHUNK);
@@ -463,8 +469,6 @@ impl Tile {
     #[inline(always)]
     fn deal_keys(&mut self, form: KeyForm, place: Place, shared: &Shared, keys: Range<usize>) {
         for i in keys.clone() {
-            // Again, for those that the first hint lost.
-            prefetch(shared.record(form, self.keys[(i + AHEAD).min(keys.end - 1)]));
             let key = self.keys[i];
             self.deal(shared.record(form, key), form.z(key), place, shared.blocks(form, key, place));
         }

@@ -154,7 +154,8 @@ impl Draw for Write<'_> {
         history.shown.extend_from_slice(shown);
         for &key in keys {
             let (group, record) = shared.form.locate(key);
-            let slot = self.first_slot[group][record] + shared.seen[group].met(record).number(self.place.tile(shared.columns), shared.columns);
+            let slot = self.first_slot[group][record]
+                + shared.seen[group].met(record).number(self.place.tile(shared.columns), shared.columns);
             history.slots.push(slot);
         }
         let mut left = tile.alive;

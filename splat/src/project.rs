@@ -539,8 +539,7 @@ impl Body for Project<'_> {
             quat[..lanes].copy_from_slice(&scene.quat[last.clone()]);
             opacity[..lanes].copy_from_slice(&scene.opacity[last.clone()]);
             colour[..lanes].copy_from_slice(&scene.colour[last]);
-            let fields =
-                Sixteen { mean: &mean, scale: &scale, quat: &quat, opacity: &opacity, colour: &colour };
+            let fields = Sixteen { mean: &mean, scale: &scale, quat: &quat, opacity: &opacity, colour: &colour };
             let valid = (u32::from(u16::MAX) >> (LANES - lanes)) as u16;
             let (easy, hard) = projector.sixteen(s, &fields, &mut rows, start as u32);
             let lanes = (easy & valid, hard & valid);
@@ -566,13 +565,7 @@ struct Keep<'a> {
 impl Keep<'_> {
     /// Appends the visible ones of sixteen: `easy` lanes from the fields of records in `rows`, `hard` lanes by the f64 path.
     #[inline(always)]
-    fn append<S: Simd>(
-        &mut self,
-        s: S,
-        start: usize,
-        rows: &mut [[f32; LANES]; LANES],
-        (easy, hard): (u16, u16),
-    ) {
+    fn append<S: Simd>(&mut self, s: S, start: usize, rows: &mut [[f32; LANES]; LANES], (easy, hard): (u16, u16)) {
         if easy | hard == 0 {
             return;
         }
@@ -898,7 +891,8 @@ mod tests {
         assert_eq!((p.z, r.nlo), (4.0, 0.0));
         assert!((r.cx - unit).abs() < 1e-7 && (r.ar - unit).abs() < 1e-7 && r.dy.abs() < 1e-7);
         assert!(
-            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6 && (r.e - unit * (f32::from(r.first[1]) + 0.5 - 24.0)).abs() < 1e-6
+            (r.d - unit * (15.5 - 32.0)).abs() < 1e-6
+                && (r.e - unit * (f32::from(r.first[1]) + 0.5 - 24.0)).abs() < 1e-6
         );
         // Radius sqrt(2 ln 255) * sqrt(25.3) = 16.74 pixels: centres 15.5..=48.5.
         assert_eq!((p.x, r.first[0]), ([15, 49], 15));

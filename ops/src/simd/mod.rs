@@ -214,3 +214,82 @@ pub(crate) fn map<S: Simd, F: Lanewise>(s: S, x: &mut [f32]) {
         tail.copy_from_slice(&block[..tail.len()]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cpu::Kernels;
+
+    /// Every operation that moves lanes or has an implementation of its own on some instruction set.
+    struct Operations {
+        rows: [[f32; LANES]; 4],
+        chosen: u16,
+    }
+
+    impl Body for Operations {
+        type Output = Vec<f32>;
+
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) -> Vec<f32> {
+            let Operations { rows, chosen } = self;
+            let flat = rows.concat();
+            let (threes, fours) = (flat.as_chunks::<3>().0, flat.as_chunks::<4>().0);
+            let (Some(threes), Some(fours)) = (threes.first_chunk(), fours.first_chunk()) else { unreachable!() };
+            let (a, b, c, d) = (s.load(&rows[0]), s.load(&rows[1]), s.load(&rows[2]), s.load(&rows[3]));
+            let (f, minus_n) = a.fraction(s);
+            let mut to = [[0.0; LANES]; 20];
+            let [x, y, z] = s.load3(threes);
+            let [p, q, r, t] = s.load4(fours);
+            let [k, l, m, n] = s.transpose_quads([a, b, c, d]);
+            for (v, to) in [x, y, z, p, q, r, t, k, l, m, n].into_iter().zip(&mut to) {
+                v.store(to);
+            }
+            a.neg_mul_add(b, c).store(&mut to[11]);
+            a.min(b).store(&mut to[12]);
+            a.minus_abs().store(&mut to[13]);
+            f.store(&mut to[14]);
+            s.splat(1.25).times_pow2(minus_n).store(&mut to[15]);
+            s.store_chosen(a, chosen, &mut to[16]);
+            to[16][chosen.count_ones() as usize..].fill(0.0);
+            let mut packed = [[0.0; 3]; LANES];
+            s.store3([a, b, c], &mut packed);
+            let mut to = to.concat();
+            to.extend(packed.as_flattened());
+            to
+        }
+    }
+
+    #[test]
+    fn every_set_moves_lanes_alike() {
+        // Whole, half and other numbers of both signs, -30 to 30: ties of rounding are among them.
+        let rows = std::array::from_fn(|j| std::array::from_fn(|i| ((i * 37 + j * 101) % 241) as f32 * 0.25 - 30.0));
+        for chosen in [0, 1, 0x8000, 0x5a5a, u16::MAX] {
+            let results: Vec<Vec<f32>> = Kernels::available().map(|k| k.enter(Operations { rows, chosen })).collect();
+            for result in &results {
+                let bits = |v: &[f32]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+                assert_eq!(bits(result), bits(&results[0]));
+            }
+            // What they mean, on one of them.
+            let (flat, got) = (rows.concat(), &results[0]);
+            let lane = |v: usize, i: usize| got[v * LANES + i];
+            for i in 0..LANES {
+                for c in 0..3 {
+                    assert_eq!(lane(c, i), flat[3 * i + c]);
+                    assert_eq!(got[20 * LANES + 3 * i + c], rows[c][i]);
+                }
+                for c in 0..4 {
+                    assert_eq!(lane(3 + c, i), flat[4 * i + c]);
+                    assert_eq!(lane(7 + c, i), rows[i / 4][4 * c + i % 4]);
+                }
+                let (a, b, c) = (rows[0][i], rows[1][i], rows[2][i]);
+                assert_eq!(lane(11, i), (-a).mul_add(b, c));
+                assert_eq!(lane(12, i), if a < b { a } else { b });
+                assert_eq!(lane(13, i), -a.abs());
+                assert_eq!(lane(14, i), a - a.round_ties_even());
+                assert_eq!(lane(15, i), 1.25 * (-a.round_ties_even()).exp2());
+            }
+            let want: Vec<f32> = (0..LANES).filter(|&i| chosen >> i & 1 != 0).map(|i| rows[0][i]).collect();
+            assert_eq!(got[16 * LANES..][..want.len()], want);
+        }
+    }
+}
