@@ -2,9 +2,13 @@
 
 mod common;
 
+use std::sync::Arc;
+
 use common::{Rng, camera, hard_scene, psnr, scene, straight};
 use sf_formats::Camera;
 use sf_formats::scene::{Gaussians, SplatSettings};
+use sf_ops::Kernels;
+use sf_ops::par::Pool;
 use sf_splat::{RenderOptions, Renderer, reference};
 
 /// Error on pixels whose decisions are all clear of their thresholds; the slack comes on top.
@@ -150,7 +154,22 @@ fn boxes_leave_nothing_out() {
 /// One picture of a street: pixels, and those outside the bounds. Asserts the PSNR.
 fn street_picture(scene: &Gaussians, camera: &Camera, settings: &SplatSettings, what: &str) -> (usize, usize) {
     let want = reference::render_boxed(scene, camera, settings, [0.0; 3]);
-    let got = Renderer::new(2).unwrap().render(scene, camera, settings, &RenderOptions::default()).unwrap();
+    let pool = Arc::new(Pool::new(2).unwrap());
+    let draw = |kernels: &'static Kernels| {
+        let mut renderer = Renderer::with_kernels(Arc::clone(&pool), kernels);
+        renderer.render(scene, camera, settings, &RenderOptions::default()).unwrap()
+    };
+    // One picture stands for all instruction sets, because they give the same bits.
+    let mut sets = Kernels::available();
+    let got = draw(sets.next().unwrap());
+    let bits = |v: &[f32]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+    for kernels in sets {
+        let other = draw(kernels);
+        assert_eq!(other.stats, got.stats, "{what}");
+        for (a, b) in [(&other.rgb, &got.rgb), (&other.depth, &got.depth), (&other.alpha, &got.alpha)] {
+            assert!(bits(a) == bits(b), "{what}: {} gives other bits", kernels.isa.name());
+        }
+    }
     let (mut outside, mut clean) = (0, 0.0f64);
     for i in 0..got.alpha.len() {
         let slack = want.slack[i];
@@ -203,6 +222,7 @@ fn large_streets_match_the_oracle() {
             }
         }
     }
-    println!("{outside} of {pixels} pixels outside");
+    let sets: Vec<_> = Kernels::available().map(|k| k.isa.name()).collect();
+    println!("{outside} of {pixels} pixels outside, the same bits with {}", sets.join(", "));
     assert!(outside * 100_000 <= pixels, "{outside} of {pixels} pixels are outside the bounds");
 }
