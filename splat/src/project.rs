@@ -580,12 +580,12 @@ impl Keep<'_> {
             }
             let room = at..at + LANES;
             for (field, plane) in [(&rows[Z_ROW], &mut seen.z), (&tile, &mut seen.tile), (&span, &mut seen.span)] {
-                let to = plane[room.clone()].as_mut_array().unwrap_or_else(|| unreachable!());
+                let to = plane[room.clone()].first_chunk_mut().unwrap_or_else(|| unreachable!());
                 s.store_chosen(s.load(field), easy, to);
             }
             s.transpose(rows);
             // Every row is written, and the next one over it where it is not visible: no branch to guess.
-            let to: &mut [Record; LANES] = seen.records[room].as_mut_array().unwrap_or_else(|| unreachable!());
+            let to: &mut [Record; LANES] = seen.records[room].first_chunk_mut().unwrap_or_else(|| unreachable!());
             let mut n = 0;
             for l in 0..LANES {
                 to[n % LANES] = record(&rows[l]);
