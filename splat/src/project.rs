@@ -152,14 +152,16 @@ pub struct Met {
 }
 
 impl Met {
-    /// From the bits `lo | hi << 16` of columns and of rows, in an image of `columns` tiles a row.
+    /// From the bits `lo | hi << 16` of columns and of rows, in an image of `columns` tiles a row. Any bits give something: lanes that
+    /// are not visible come through here, too, and are not kept.
     #[inline(always)]
     fn new(x: u32, y: u32, columns: u32) -> Met {
-        let (x0, x1) = (x & 0xffff, (x >> 16) - 1);
-        let (y0, y1) = (y & 0xffff, (y >> 16) - 1);
+        let (x0, x1) = (x & 0xffff, (x >> 16).wrapping_sub(1));
+        let (y0, y1) = (y & 0xffff, (y >> 16).wrapping_sub(1));
         let rect = (x0 >> 2 & 7) | (x1 >> 2 & 7) << 3 | (y0 >> 2 & 7) << 6 | (y1 >> 2 & 7) << 9;
-        let (wide, high) = (x1 / TILE - x0 / TILE, y1 / TILE - y0 / TILE);
-        Met { tile: y0 / TILE * columns + x0 / TILE, span: rect | wide << 12 | high << 22 }
+        let (wide, high) = ((x1 / TILE).wrapping_sub(x0 / TILE), (y1 / TILE).wrapping_sub(y0 / TILE));
+        let tile = (y0 / TILE).wrapping_mul(columns).wrapping_add(x0 / TILE);
+        Met { tile, span: rect | wide << 12 | high << 22 }
     }
 
     /// Further columns and rows of tiles.
