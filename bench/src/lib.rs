@@ -182,6 +182,12 @@ pub fn product_s8(ctx: Ctx, (m, k, n): (usize, usize, usize), after: After) -> L
 pub fn linear_s8(ctx: Ctx, (m, k, n): (usize, usize, usize)) -> Layer {
     let (l, x, mut y) = (Linear::new(2, n, k), Aligned::of(&values(1, m * k)), Aligned::zeros(m * n));
     let (mut q, mut steps) = (Aligned::zeros(m * padded_k(k)), vec![0.0; m]);
+    // The definition in f32, on the weights' integers.
+    let expected = some_rows(m).map(|r| {
+        let mut row = x.get()[r * k..][..k].to_vec();
+        rotate_rows(ctx, Rotation::new(k, &l.signs), MatMut::new(&mut row, 1, k));
+        (r, reference::linear(Mat::new(&row, 1, k), &l.exact, Some(&l.bias)))
+    });
     let mut one = move |ctx: Ctx, y: &mut [f32]| {
         let before = Before { norm: None, rotation: Some(Rotation::new(k, &l.signs)) };
         let rows = RowsS8Mut { m, k, data: q.get_mut(), scales: &mut steps };
@@ -191,7 +197,10 @@ pub fn linear_s8(ctx: Ctx, (m, k, n): (usize, usize, usize)) -> Layer {
         gemm_s8(ctx, a, l.w.get(), ep, MatMut::new(y, m, n));
     };
     one(ctx, y.get_mut());
-    assert!(y.get().iter().all(|v| v.is_finite()) && y.get().iter().any(|v| *v != 0.0), "{m} x {k} x {n}");
+    for (r, exact) in expected {
+        let db = snr(&exact, &y.get()[r * n..][..n]);
+        assert!(db > 30.0, "{db:.1} dB between int8 and f32, {m} x {k} x {n}, row {r}");
+    }
     Layer {
         kind: "linear s8",
         size: format!("{m}x{k}x{n}"),
@@ -590,6 +599,9 @@ pub fn layers() -> Vec<Box<dyn Fn(Ctx) -> Layer>> {
     }
     for size in [(884, 192, 768), (1956, 128, 512), (868, 1024, 1024)] {
         list.push(Box::new(move |ctx| product_s8(ctx, size, After::Quantized)));
+    }
+    for size in [(868, 1024, 1024), (884, 192, 768)] {
+        list.push(Box::new(move |ctx| linear_s8(ctx, size)));
     }
     for (frames, tokens, sees) in [(4, 217, Sees::OWN), (4, 217, Sees::ALL), (4, 745, Sees::OWN), (4, 745, Sees::ALL)] {
         list.push(Box::new(move |ctx| block(ctx, (frames, tokens, 16, 64), sees)));

@@ -41,7 +41,8 @@ pub(crate) fn near_l2<T>(at: *const T) {
     let _ = at;
 }
 
-/// Starts to bring the cache line of any address near, to be written (where a CPU lacks that form it does nothing).
+/// Starts to bring the cache line of any address near, to be written. On x86-64 a plain prefetch while the kernels do not enable
+/// `prfchw`: a line that no other core holds arrives writable anyway.
 #[inline(always)]
 pub(crate) fn near_for_writing<T>(at: *const T) {
     #[cfg(target_arch = "x86_64")]
