@@ -10,7 +10,8 @@ use crate::attention::heads::{KeyPack, QueryPack, ValuePack};
 use crate::attention::softmax::{MergeS8, Rows, SoftmaxTile, WeightsS8};
 use crate::cpu::{Features, Kernels};
 use crate::gemm::pack::RowPack;
-use crate::gemm::s8::tile::{FinishS8, QuadPack, WidePack};
+use crate::gemm::s8::finish::FinishS8;
+use crate::gemm::s8::rows::{QuadPack, WidePack};
 use crate::gemm::tile::Finish;
 use crate::layernorm::NormRow;
 use crate::peak::Width;
@@ -51,11 +52,11 @@ pub struct VectorKernels {
     pub(crate) finish: unsafe fn(Finish),
     /// `gemm::pack::pack_rows`.
     pub(crate) pack: unsafe fn(RowPack),
-    /// `gemm::s8::tile::pack_quads`.
+    /// `gemm::s8::rows::pack_quads`.
     pub(crate) pack_quads: unsafe fn(QuadPack),
-    /// `gemm::s8::tile::pack_wide`.
+    /// `gemm::s8::rows::pack_wide`.
     pub(crate) pack_wide: unsafe fn(WidePack),
-    /// `gemm::s8::tile::finish`.
+    /// `gemm::s8::finish::finish`.
     pub(crate) finish_s8: unsafe fn(FinishS8),
     /// `hadamard::rotate`.
     pub(crate) rotate: unsafe fn(&mut [f32], &[u16], usize),
@@ -139,16 +140,16 @@ macro_rules! vector_kernels {
                 crate::gemm::pack::pack_rows($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
-            fn pack_quads(rows: crate::gemm::s8::tile::QuadPack) {
-                crate::gemm::s8::tile::pack_quads($token::new(), rows);
+            fn pack_quads(rows: crate::gemm::s8::rows::QuadPack) {
+                crate::gemm::s8::rows::pack_quads($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
-            fn pack_wide(rows: crate::gemm::s8::tile::WidePack) {
-                crate::gemm::s8::tile::pack_wide($token::new(), rows);
+            fn pack_wide(rows: crate::gemm::s8::rows::WidePack) {
+                crate::gemm::s8::rows::pack_wide($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
-            fn finish_s8(tile: crate::gemm::s8::tile::FinishS8) {
-                crate::gemm::s8::tile::finish($token::new(), tile);
+            fn finish_s8(tile: crate::gemm::s8::finish::FinishS8) {
+                crate::gemm::s8::finish::finish($token::new(), tile);
             }
             $(#[target_feature(enable = $features)])?
             fn rotate(x: &mut [f32], signs: &[u16], block: usize) {

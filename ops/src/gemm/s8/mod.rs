@@ -6,11 +6,15 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | `pack.rs` | K4N16 panels, rows of activations |
-//! | `tile.rs` | the tile over `Dot8`, packing of rows, epilogue |
+//! | `pack.rs` | K4N16 panels, rows as they lie in memory |
+//! | `rows.rs` | rows of activations in the order of a tile |
+//! | `tile.rs` | the tile over `Dot8` |
+//! | `ahead.rs` | what a tile asks the caches for meanwhile |
+//! | `finish.rs` | the epilogue |
 //! | `table.rs` | the kernels |
 //! | `scalar.rs` `avx2.rs` `avx2wide.rs` `avxvnni.rs` `avx512vnni.rs` `neon.rs` `neondot.rs` | one `Dot8` each |
 
+pub(crate) mod ahead;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
@@ -19,11 +23,13 @@ pub(crate) mod avx2wide;
 pub(crate) mod avx512vnni;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avxvnni;
+pub(crate) mod finish;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neondot;
 pub mod pack;
+pub(crate) mod rows;
 pub(crate) mod scalar;
 pub mod table;
 pub(crate) mod tile;
@@ -35,9 +41,12 @@ use crate::mat::MatMut;
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::quantize::{Before, QuantizeRow};
+use ahead::Ahead;
+use finish::{ColumnsS8, FinishS8, Plus};
 use pack::{PanelsS8, QUAD, RowsS8, RowsS8Mut, STEP, padded_k};
+use rows::{QuadPack, WidePack};
 use table::{Activations, GemmS8Kernel};
-use tile::{Ahead, ColumnsS8, FinishS8, MAX_NV, Plus, QuadPack, TileS8, WidePack};
+use tile::{MAX_NV, TileS8};
 
 /// Packed activations of one task, in words of four bytes: at most 256 KiB, a quarter of a usual second-level cache, so that the
 /// panels streaming past do not drive them out.

@@ -1,8 +1,10 @@
 //! The list of int8 matrix kernels, best first. Selection, tests, benches and `doctor` read it.
 #![allow(unsafe_code)]
 
+use super::finish::FinishS8;
+use super::rows::{QuadPack, WidePack};
 use super::scalar;
-use super::tile::{ColumnS8, FinishS8, QuadPack, TileS8, WidePack};
+use super::tile::{ColumnS8, TileS8};
 #[cfg(target_arch = "x86_64")]
 use super::{avx2, avx2wide, avx512vnni, avxvnni};
 #[cfg(target_arch = "aarch64")]

@@ -1,0 +1,92 @@
+//! What a tile asks the caches for while it multiplies: its outputs, which would else be missed when they are stored, and the weights
+//! that come after its own.
+
+use crate::prefetch::{near_for_writing, near_l2};
+use crate::simd::LANES;
+
+/// Memory that a tile asks for while it multiplies. Hints: no effect on results, any address is safe.
+#[derive(Clone, Copy)]
+pub(crate) struct Ahead {
+    /// First output of the tile.
+    out: *const u8,
+    /// Bytes from one row of outputs to the next.
+    stride: usize,
+    /// Weights that are read after these.
+    next: *const u8,
+    /// Bytes of them for each step.
+    per_step: usize,
+    /// Cache lines of them to ask for at a time.
+    next_lines: usize,
+    /// Whether there is anything to ask for.
+    any: bool,
+}
+
+/// Most cache lines of the next weights to ask for at a time.
+const NEXT_LINES: usize = 4;
+/// Steps between asking for operands and their use: some 100 cycles, more than the second-level cache takes.
+pub(super) const EARLY: usize = 8;
+
+impl Ahead {
+    /// Nothing: points at operands that are near anyway.
+    pub(crate) fn nothing<T>(near: &[T]) -> Ahead {
+        Ahead {
+            out: near.as_ptr().cast(),
+            stride: 0,
+            next: near.as_ptr().cast(),
+            per_step: 0,
+            next_lines: 0,
+            any: false,
+        }
+    }
+
+    /// With the outputs from `first` on, rows `stride` values apart.
+    pub(crate) fn with_outputs(self, first: *const f32, stride: usize) -> Ahead {
+        Ahead { out: first.cast(), stride: stride * size_of::<f32>(), any: true, ..self }
+    }
+
+    /// With the weights `next` that come after these, `per_step` bytes for each of `steps` steps of a tile of `lines` lines of outputs.
+    pub(crate) fn with_weights(self, next: *const i8, per_step: usize, lines: usize, steps: usize) -> Ahead {
+        let next_lines = (per_step * (steps / lines).max(1)).div_ceil(64).min(NEXT_LINES);
+        Ahead { next: next.cast(), per_step, next_lines, any: true, ..self }
+    }
+
+    /// For a loop of `steps` steps of a tile of `rows` x `NV` panels.
+    #[inline(always)]
+    pub(super) fn over<const NV: usize>(self, rows: usize, steps: usize) -> Asking<NV> {
+        let each = (steps / (rows * NV)).max(1);
+        Asking { ahead: self, each, step: each * self.per_step, line: 0, lines: rows * NV, steps }
+    }
+}
+
+/// Asks for a line of outputs and a share of the next weights now and then.
+pub(super) struct Asking<const NV: usize> {
+    ahead: Ahead,
+    /// Steps between two lines.
+    each: usize,
+    /// Bytes of the next weights in so many.
+    step: usize,
+    line: usize,
+    lines: usize,
+    steps: usize,
+}
+
+impl<const NV: usize> Asking<NV> {
+    /// Steps until the next line; those left if `ask` is false or no line is left.
+    #[inline(always)]
+    pub(super) fn next(&mut self, ask: bool, done: usize) -> usize {
+        let left = self.steps - done;
+        if !ask || !self.ahead.any || self.line == self.lines {
+            return left;
+        }
+        near_for_writing(self.ahead.out.wrapping_add(self.line % NV * (LANES * size_of::<f32>())));
+        self.line += 1;
+        if self.line.is_multiple_of(NV) {
+            self.ahead.out = self.ahead.out.wrapping_add(self.ahead.stride);
+        }
+        for i in 0..self.ahead.next_lines {
+            near_l2(self.ahead.next.wrapping_add(i * 64));
+        }
+        self.ahead.next = self.ahead.next.wrapping_add(self.step);
+        self.each.min(left)
+    }
+}

@@ -1,0 +1,198 @@
+//! The epilogue of int8 tiles: sums to f32, bias, activation, gamma, residual, while they are in the cache.
+
+use super::pack::PanelsS8;
+use super::tile::MAX_NV;
+use crate::activation::{Gelu, Relu, gelu_lanes, relu_lanes};
+use crate::gemm::Act;
+use crate::par::SharedMut;
+use crate::simd::{LANES, Lanewise, Simd, Vector};
+
+/// What is added to an output when it is stored.
+#[derive(Clone, Copy)]
+pub(crate) enum Plus<'a> {
+    Nothing,
+    /// What the output holds.
+    Output,
+    /// The value at the same place of another matrix of the output's shape.
+    Other(&'a [f32]),
+}
+
+/// The epilogue of one tile of sums.
+pub(crate) struct FinishS8<'a> {
+    /// `[panel][row][16]`.
+    pub acc: &'a [i32],
+    /// Values from one panel's sums to the next.
+    pub acc_stride: usize,
+    /// Panels in use.
+    pub panels: usize,
+    /// Scale of each row in use.
+    pub row_scales: &'a [f32],
+    /// What is fixed per output.
+    pub columns: &'a ColumnsS8,
+    /// Activation.
+    pub act: Act,
+    /// Whether `columns.gamma` applies.
+    pub gamma: bool,
+    /// What is added.
+    pub plus: Plus<'a>,
+    /// Whether the output is rectified after that.
+    pub relu_sum: bool,
+    /// The whole output.
+    pub out: &'a SharedMut<'a, f32>,
+    /// Place of the tile's first value in it.
+    pub at: usize,
+    /// Values from one row to the next.
+    pub stride: usize,
+    /// Columns in use.
+    pub cols: usize,
+}
+
+/// Per-output values of the panels of a tile, zeros beyond n.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct ColumnsS8 {
+    pub scales: [[f32; LANES]; MAX_NV],
+    pub bias: [[f32; LANES]; MAX_NV],
+    pub gamma: [[f32; LANES]; MAX_NV],
+}
+
+impl ColumnsS8 {
+    /// Of `panels` panels from `panel` on; the bias repeats over the outputs with its length as period.
+    pub(crate) fn of(
+        w: PanelsS8,
+        (panel, panels): (usize, usize),
+        bias: Option<&[f32]>,
+        gamma: Option<&[f32]>,
+    ) -> ColumnsS8 {
+        let mut columns = ColumnsS8::default();
+        for v in 0..panels {
+            let col = (panel + v) * LANES;
+            let cols = LANES.min(w.n - col);
+            columns.scales[v][..cols].copy_from_slice(&w.scales[col..col + cols]);
+            if let Some(bias) = bias {
+                for (i, b) in columns.bias[v][..cols].iter_mut().enumerate() {
+                    *b = bias[(col + i) % bias.len()];
+                }
+            }
+            if let Some(gamma) = gamma {
+                columns.gamma[v][..cols].copy_from_slice(&gamma[col..col + cols]);
+            }
+        }
+        columns
+    }
+
+    /// Without the first `panels` panels.
+    pub(crate) fn from(&self, panels: usize) -> ColumnsS8 {
+        let mut columns = *self;
+        columns.scales.rotate_left(panels);
+        columns.bias.rotate_left(panels);
+        columns.gamma.rotate_left(panels);
+        columns
+    }
+}
+
+/// y = act(fma(acc, row scale * output scale, bias)) * gamma; out = out + y or y. Every step rounds once.
+#[inline(always)]
+pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
+    let whole = t.cols == t.panels * LANES && !t.gamma && !t.relu_sum && matches!(t.plus, Plus::Nothing);
+    // Most tiles: nothing to decide for each vector.
+    match (whole, t.panels, t.act) {
+        (true, 2, Act::None) => finish_whole::<S, Same, 2>(s, &t),
+        (true, 2, Act::Gelu) => finish_whole::<S, Gelu, 2>(s, &t),
+        (true, 2, Act::Relu) => finish_whole::<S, Relu, 2>(s, &t),
+        (true, 1, Act::None) => finish_whole::<S, Same, 1>(s, &t),
+        (true, 1, Act::Gelu) => finish_whole::<S, Gelu, 1>(s, &t),
+        (true, 1, Act::Relu) => finish_whole::<S, Relu, 1>(s, &t),
+        _ => finish_any(s, &t),
+    }
+}
+
+/// No activation.
+struct Same;
+
+impl Lanewise for Same {
+    #[inline(always)]
+    fn apply<S: Simd>(_: S, x: S::V) -> S::V {
+        x
+    }
+}
+
+/// Whole panels, activation `F`, nothing added.
+#[inline(always)]
+fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &FinishS8) {
+    let rows = t.row_scales.len();
+    let mut acc: [&[[i32; LANES]]; NV] = [&[]; NV];
+    let mut scale = [s.splat(0.0); NV];
+    let mut bias = [s.splat(0.0); NV];
+    for v in 0..NV {
+        acc[v] = &t.acc[v * t.acc_stride..].as_chunks::<LANES>().0[..rows];
+        scale[v] = s.load(&t.columns.scales[v]);
+        bias[v] = s.load(&t.columns.bias[v]);
+    }
+    for r in 0..rows {
+        let at = t.at + r * t.stride;
+        // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
+        #[allow(unsafe_code)]
+        let out = unsafe { t.out.slice(at..at + NV * LANES) };
+        let out = &mut out.as_chunks_mut::<LANES>().0[..NV];
+        let row = s.splat(t.row_scales[r]);
+        for v in 0..NV {
+            F::apply(s, s.load_i32(&acc[v][r]).mul_add(row * scale[v], bias[v])).store(&mut out[v]);
+        }
+    }
+}
+
+/// Any tile.
+#[inline(always)]
+fn finish_any<S: Simd>(s: S, t: &FinishS8) {
+    let rows = t.row_scales.len();
+    for p in 0..t.panels {
+        let acc = &t.acc[p * t.acc_stride..][..rows * LANES].as_chunks::<LANES>().0[..rows];
+        let scale = s.load(&t.columns.scales[p]);
+        let bias = s.load(&t.columns.bias[p]);
+        let gamma = s.load(&t.columns.gamma[p]);
+        let cols = LANES.min(t.cols - p * LANES);
+        for r in 0..rows {
+            let mut y = s.load_i32(&acc[r]).mul_add(s.splat(t.row_scales[r]) * scale, bias);
+            match t.act {
+                Act::None => {}
+                Act::Gelu => y = gelu_lanes(s, y),
+                Act::Relu => y = relu_lanes(s, y),
+            }
+            if t.gamma {
+                y = y * gamma;
+            }
+            let at = t.at + r * t.stride + p * LANES;
+            // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
+            #[allow(unsafe_code)]
+            let out = unsafe { t.out.slice(at..at + cols) };
+            let mut lanes = [0.0; LANES];
+            match t.plus {
+                Plus::Nothing => {}
+                Plus::Output => y = load_some(s, out, &mut lanes) + y,
+                Plus::Other(x) => y = load_some(s, &x[at..at + cols], &mut lanes) + y,
+            }
+            if t.relu_sum {
+                y = relu_lanes(s, y);
+            }
+            match out.first_chunk_mut::<LANES>() {
+                Some(out) => y.store(out),
+                None => {
+                    y.store(&mut lanes);
+                    out.copy_from_slice(&lanes[..out.len()]);
+                }
+            }
+        }
+    }
+}
+
+/// Up to sixteen values, zeros beyond.
+#[inline(always)]
+fn load_some<S: Simd>(s: S, x: &[f32], lanes: &mut [f32; LANES]) -> S::V {
+    match x.first_chunk::<LANES>() {
+        Some(x) => s.load(x),
+        None => {
+            lanes[..x.len()].copy_from_slice(x);
+            s.load(lanes)
+        }
+    }
+}
