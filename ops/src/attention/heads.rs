@@ -148,7 +148,7 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
             }
         }
         if norm.is_some() {
-            // The bits of `layernorm::moments`: lanes that are not used add 0.
+            // One chain: a head is few vectors, and another row's chain runs beside it. Lanes that are not used add 0.
             let mut sum = zero;
             for i in 0..n {
                 sum = sum + v[i];
