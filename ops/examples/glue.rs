@@ -7,12 +7,14 @@
 //! ```
 //!
 //! The exclusive count of a vector kernel over 65,536 values is its cost for each; `docs/kernels.md` has the table.
+//! With the name of an op and a number of runs (`glue layernorm 2000`) it tells the median time of a value instead.
 
 use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, RowsS8Mut, gemm_s8, panel_len_s8};
 use sf_ops::hadamard::{Rotation, rotate_rows};
 use sf_ops::quantize::{Before, Norm, quantize};
 use sf_ops::rope::{AngleRound, QkNorm, RopeTable, qk_norm_rope};
 use sf_ops::{Ctx, Kernels, Mat, MatMut, elementwise, layernorm, par::Pool};
+use std::time::Instant;
 
 const ROWS: usize = 64;
 const COLS: usize = 1024;
@@ -25,10 +27,22 @@ fn main() {
     let a = Mat::new(&x, ROWS, COLS);
     let mut y = x.clone();
     let wanted = std::env::args().nth(1);
+    let runs: Option<usize> = std::env::args().nth(2).map(|n| n.parse().expect("a number of runs"));
     let mut op = |name: &str, run: &mut dyn FnMut(&mut [f32])| {
-        if wanted.as_ref().is_none_or(|w| w == name) {
-            run(&mut y);
-            println!("{name}");
+        if wanted.as_ref().is_some_and(|w| w != name) {
+            return;
+        }
+        let mut times: Vec<f64> = (0..runs.unwrap_or(1).max(1))
+            .map(|_| {
+                let began = Instant::now();
+                run(&mut y);
+                began.elapsed().as_secs_f64()
+            })
+            .collect();
+        times.sort_by(f64::total_cmp);
+        match runs {
+            Some(_) => println!("{name}: {:.4} ns a value", 1e9 * times[times.len() / 2] / (ROWS * COLS) as f64),
+            None => println!("{name}"),
         }
     };
     op("layernorm", &mut |y| {
