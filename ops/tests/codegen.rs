@@ -41,14 +41,16 @@ fn address(line: &str) -> Option<u64> {
 }
 
 /// Whether a vector goes to or comes from the stack. Only asked of release builds: with debug assertions the
-/// weights pass through it.
-fn spills(line: &str) -> bool {
-    !cfg!(debug_assertions) && line.contains("mm") && (line.contains("(%rsp") || line.contains("(%rbp"))
+/// weights pass through it. `%rbp` is the stack where a function has a frame, else a register like others.
+fn spills(line: &str, frame: bool) -> bool {
+    let stack = line.contains("(%rsp") || frame && line.contains("(%rbp");
+    !cfg!(debug_assertions) && line.contains("mm") && stack
 }
 
 /// Loops of one function's listing, without those that hold another loop's jump.
 fn loops(lines: &[&str], work: &str) -> Vec<Loop> {
     let mut found = Vec::new();
+    let frame = lines.iter().any(|l| l.contains("mov ") && l.ends_with("%rsp,%rbp"));
     for (i, line) in lines.iter().enumerate() {
         let mut words = line.split('\t').nth(1).unwrap_or("").split_whitespace();
         let (Some(op), Some(target)) = (words.next(), words.next()) else { continue };
@@ -60,7 +62,7 @@ fn loops(lines: &[&str], work: &str) -> Vec<Loop> {
         let body = &lines[start..=i];
         found.push(Loop {
             multiply_adds: body.iter().filter(|l| l.contains(work)).count(),
-            clean: !body.iter().any(|l| l.contains("call") || spills(l)),
+            clean: !body.iter().any(|l| l.contains("call") || spills(l, frame)),
         });
     }
     found
