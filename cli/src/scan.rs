@@ -1,8 +1,9 @@
 //! Which layers int8 is too coarse for: the sensitivity scan of `convert --check`.
 //!
 //! When an int8 model misses its gates, every int8 layer (every block in networks of more than [`MAX_SINGLE`] layers) is
-//! set to f16 by itself, and what the gates gain is measured. Then layers become f16 in the order of gain per
-//! multiply-add until the gates pass, up to [`BUDGET`] of the multiply-adds.
+//! set to f16 by itself, and so is the attention of every stack of blocks; what the gates gain is measured. Then these
+//! candidates become f16 in the order of gain per multiply-add until the gates pass, up to [`BUDGET`] of the multiply-adds.
+//! One that no longer gains beside those before it is left as it was: errors of several layers cancel as it happens.
 
 use crate::args::EngineArgs;
 use crate::model::{Scratch, scratch_folder};
@@ -90,24 +91,32 @@ impl<'a> Judge<'a> {
         }
         drop(progress);
         candidates.sort_by(|a, b| (b.gain / b.share).total_cmp(&(a.gain / a.share)));
-        let (mut promoted, mut share) = (Vec::new(), 0.0);
+        let work = Work::of(&report.config);
+        let mut promoted: Vec<String> = Vec::new();
+        let mut left = start;
         for c in candidates.iter().filter(|c| c.gain > 0.0) {
-            if share + c.share > BUDGET {
+            let mut more = promoted.clone();
+            more.extend(c.names.iter().filter(|n| !promoted.contains(n)).cloned());
+            if more.len() == promoted.len() || work.share(&more) > BUDGET {
                 continue;
             }
-            share += c.share;
-            promoted.extend(c.names.iter().cloned());
-            verdict = self.trial(&Options { promoted: promoted.clone(), ..options.clone() })?.0;
+            let found = self.trial(&Options { promoted: more.clone(), ..options.clone() })?.0;
+            let after = excess(gates, &found);
+            if after >= left {
+                continue;
+            }
+            (promoted, verdict, left) = (more, found, after);
             console.note(format!(
                 "{} as f16 ({:.2} % of the work): {:.3}",
                 c.label,
-                100.0 * share,
+                100.0 * work.share(&promoted),
                 versus::load(gates, &verdict)
             ));
             if versus::failures(gates, &verdict).is_empty() {
                 return Ok(promoted);
             }
         }
+        let share = work.share(&promoted);
         Err(Error::CheckFailed(format!(
             "with {:.1} % of the multiply-adds as f16 (the most allowed is {:.0} %) still: {}",
             100.0 * share,
@@ -131,39 +140,56 @@ fn excess(gates: &[Gate], verdict: &Verdict) -> f64 {
     gates.iter().map(|g| g.load(&verdict.outputs).powi(2)).sum()
 }
 
-/// int8 layers, or blocks of them where there are many.
+/// int8 layers, or blocks of them where there are many; and the attention of every stack of blocks, which runs in floats once its
+/// output layers are no int8.
 fn candidates(report: &Report) -> Vec<Candidate> {
-    let work = work(&report.config);
-    let total: f64 = work.values().sum();
+    let work = Work::of(&report.config);
     let int8: Vec<&str> = report.tensors.iter().filter(|t| t.dtype == Dtype::Int8).map(|t| t.name.as_str()).collect();
     let label = |name: &str| {
         let layer = name.strip_suffix(".weight").unwrap_or(name);
         let block = layer.split_once(".attn.").or_else(|| layer.split_once(".mlp."));
         if int8.len() > MAX_SINGLE { block.map_or(layer, |(block, _)| block).to_string() } else { layer.to_string() }
     };
-    let mut groups: BTreeMap<String, Candidate> = BTreeMap::new();
+    let mut groups: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for name in &int8 {
-        let group = groups.entry(label(name)).or_insert_with_key(|label| Candidate {
-            label: label.clone(),
-            names: Vec::new(),
-            share: 0.0,
-            gain: 0.0,
-        });
-        group.names.push(name.to_string());
-        group.share += work[*name] / total;
+        groups.entry(label(name)).or_default().push(name.to_string());
+        if let Some(stack) = stack_of(name) {
+            groups.entry(format!("attention of {stack}")).or_default().push(name.to_string());
+        }
     }
-    groups.into_values().collect()
+    let candidate =
+        |(label, names): (String, Vec<String>)| Candidate { label, share: work.share(&names), names, gain: 0.0 };
+    groups.into_iter().map(candidate).collect()
 }
 
-/// Multiply-adds by name.
-fn work(config: &ModelConfig) -> BTreeMap<String, f64> {
-    arch::tensors(config).iter().map(|s| (s.name.clone(), multiply_adds(config, s))).collect()
+/// The stack of blocks (`decoder` of `decoder.3`) whose attention a matrix ends.
+fn stack_of(name: &str) -> Option<&str> {
+    let block = name.strip_suffix(".attn.proj.weight")?;
+    block.rsplit_once('.').map(|(stack, _)| stack)
 }
 
-/// Share of the multiply-adds in these matrices.
+/// Multiply-adds of a network's matrices.
+struct Work {
+    by_name: BTreeMap<String, f64>,
+    all: f64,
+}
+
+impl Work {
+    fn of(config: &ModelConfig) -> Work {
+        let by_name: BTreeMap<String, f64> =
+            arch::tensors(config).iter().map(|s| (s.name.clone(), multiply_adds(config, s))).collect();
+        Work { all: by_name.values().sum(), by_name }
+    }
+
+    /// Share of the multiply-adds in these matrices.
+    fn share(&self, names: &[String]) -> f64 {
+        names.iter().filter_map(|n| self.by_name.get(n)).sum::<f64>() / self.all
+    }
+}
+
+/// Share of a network's multiply-adds in these matrices.
 pub(crate) fn share(config: &ModelConfig, names: &[String]) -> f64 {
-    let work = work(config);
-    names.iter().filter_map(|n| work.get(n)).sum::<f64>() / work.values().sum::<f64>()
+    Work::of(config).share(names)
 }
 
 /// Runs clips through a checkpoint in f32 and gathers what its linear layers read.
@@ -195,4 +221,20 @@ fn model(source: &dyn Checkpoint, folder: &Scratch, name: &str, options: &Option
     // The mapping keeps the unlinked file.
     std::fs::remove_file(&file).map_err(|e| Error::io(&file, "remove", &e))?;
     Ok((Arc::new(Model::from_blob(blob)?), report))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attention_goes_by_stacks() {
+        assert_eq!(stack_of("decoder.3.attn.proj.weight"), Some("decoder"));
+        assert_eq!(stack_of("point_decoder.blocks.0.attn.proj.weight"), Some("point_decoder.blocks"));
+        assert_eq!((stack_of("decoder.3.attn.qkv.weight"), stack_of("gs_head.conv.0.weight")), (None, None));
+        let config = ModelConfig::nano();
+        let work = Work::of(&config);
+        let all: Vec<String> = work.by_name.keys().cloned().collect();
+        assert!((work.share(&all) - 1.0).abs() < 1e-12 && work.share(&[]) == 0.0);
+    }
 }
