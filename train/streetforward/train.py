@@ -44,7 +44,7 @@ WEIGHTS = {
     "translation": 0.4,
     "focal": 2.0,
     "velocity": 0.2,  # per pass, summed over the three axes
-    "dynamic": 0.25,  # per pass
+    "dynamic": 0.4,  # per pass
     "matching": 0.6,  # shared by the supervised heads
     "displacement": 1.5,  # shared by the probed layers
 }
