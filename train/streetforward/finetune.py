@@ -169,7 +169,9 @@ class Run:
         self.optimizer = Optimizer(self.model, chosen, lr=args.lr, muon_lr=2 * args.lr, ema=args.ema)
         self.thaw = Thaw(self.optimizer, self.model, schedule)
         self.samples, self.elapsed = 0, 0.0
-        note(self.args, event="start", trained=len(self.optimizer.names), new=missing[:20], new_count=len(missing))
+        split = self.model.config["render.split"]  # "hard": images teach nothing about what moves
+        trained = len(self.optimizer.names)
+        note(self.args, event="start", trained=trained, split=split, new=missing[:20], new_count=len(missing))
         resume(self)
         width, height = (int(n) for n in args.size.split("x"))
         self.context = [int(n) for n in args.context.split(",")]
