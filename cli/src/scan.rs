@@ -150,13 +150,15 @@ fn candidates(report: &Report) -> Vec<Candidate> {
         let block = layer.split_once(".attn.").or_else(|| layer.split_once(".mlp."));
         if int8.len() > MAX_SINGLE { block.map_or(layer, |(block, _)| block).to_string() } else { layer.to_string() }
     };
-    let mut groups: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    let (mut groups, mut stacks) = (BTreeMap::<String, Vec<String>>::new(), BTreeMap::<String, Vec<String>>::new());
     for name in &int8 {
         groups.entry(label(name)).or_default().push(name.to_string());
         if let Some(stack) = stack_of(name) {
-            groups.entry(format!("attention of {stack}")).or_default().push(name.to_string());
+            stacks.entry(format!("attention of {stack}")).or_default().push(name.to_string());
         }
     }
+    // That of a single block is a layer of its own.
+    groups.extend(stacks.into_iter().filter(|(_, names)| names.len() > 1));
     let candidate =
         |(label, names): (String, Vec<String>)| Candidate { label, share: work.share(&names), names, gain: 0.0 };
     groups.into_iter().map(candidate).collect()

@@ -43,24 +43,12 @@ pub trait Simd: Copy {
     /// Vector c, lane i from `x[i][c]`.
     #[inline(always)]
     fn load3(self, x: &[[f32; 3]; LANES]) -> [Self::V; 3] {
-        std::array::from_fn(|c| {
-            let mut lanes = [0.0; LANES];
-            for i in 0..LANES {
-                lanes[i] = x[i][c];
-            }
-            self.load(&lanes)
-        })
+        columns(self, x)
     }
     /// Vector c, lane i from `x[i][c]`.
     #[inline(always)]
     fn load4(self, x: &[[f32; 4]; LANES]) -> [Self::V; 4] {
-        std::array::from_fn(|c| {
-            let mut lanes = [0.0; LANES];
-            for i in 0..LANES {
-                lanes[i] = x[i][c];
-            }
-            self.load(&lanes)
-        })
+        columns(self, x)
     }
     /// Vector c, lane i to `x[i][c]`.
     #[inline(always)]
@@ -110,6 +98,20 @@ pub trait Simd: Copy {
             }
         }
     }
+}
+
+/// Vector c, lane i from `x[i][c]`.
+#[inline(always)]
+fn columns<S: Simd, const N: usize>(s: S, x: &[[f32; N]; LANES]) -> [S::V; N] {
+    let mut vectors = [s.splat(0.0); N];
+    for c in 0..N {
+        let mut lanes = [0.0; LANES];
+        for i in 0..LANES {
+            lanes[i] = x[i][c];
+        }
+        vectors[c] = s.load(&lanes);
+    }
+    vectors
 }
 
 /// Sixteen f32 lanes.
