@@ -85,6 +85,11 @@ impl<'a> ConvLayer<'a> {
     pub(crate) fn same(weights: &'a Linear, kernel: usize) -> ConvLayer<'a> {
         ConvLayer { weights, kernel, stride: 1, act: Act::None, relu_input: Act::None }
     }
+
+    /// Of an input that is rectified on the fly, or is already.
+    pub(crate) fn on_rectified(self) -> ConvLayer<'a> {
+        ConvLayer { relu_input: Act::Relu, ..self }
+    }
 }
 
 impl Net<'_> {

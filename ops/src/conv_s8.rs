@@ -7,9 +7,11 @@
 //! | windows that overlap (kernel > stride) | one per band of output lines, from the input lines under it ([`band_lines`]) |
 //! | windows that do not (1 x 1, patches, transposed) | one per window |
 //!
-//! It is max |x| / 127 over those values (after the rectifier where there is one), with the rules of [`crate::quantize`]: zeros give
-//! scale 0, a value that is not finite gives scale NaN and so NaN outputs. Bands follow from the shape alone, so results depend
-//! neither on threads nor on the instruction set. In the map a pixel's channels are padded to four with zeros.
+//! It is max |x| / 127 over those values, with the rules of [`crate::quantize`]: zeros give scale 0, a value that is not finite gives
+//! scale NaN and so NaN outputs. A rectified input has no negative values, so its integers run from 0 to 255 and the scale is max / 255:
+//! they lie as -128 to 127 in the map, and sums start at 128 times the weights' sum (x86 takes them as unsigned bytes and starts at
+//! zero). Bands follow from the shape alone, so results depend neither on threads nor on the instruction set. In the map a pixel's
+//! channels are padded to four; the weights there are zeros.
 //!
 //! y = act(fma(f32(sum), input scale * output scale, bias)); y = residual + y; rectified again with `relu_sum`.
 
@@ -27,7 +29,7 @@ use crate::gemm::{Act, Sink};
 use crate::mat::{Hwc, HwcMut};
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
-use crate::quantize::{MapOut, MapScale, ToMap, inverse_and_scale, larger};
+use crate::quantize::{MapOut, MapScale, ToMap, inverse_and_scale, larger, zero_of};
 use std::ops::Range;
 
 /// A convolution layer with int8 weights.
@@ -44,7 +46,8 @@ pub struct ConvS8<'a> {
     pub stride: usize,
     /// Zeros around the input.
     pub pad: usize,
-    /// Applied to the input on the fly: `None` or `Relu`.
+    /// Applied to the input on the fly: `None` or `Relu`. An input without negative values should say `Relu` too: its steps are
+    /// then half as wide.
     pub relu_input: Act,
     /// Applied to the sum with the bias.
     pub act: Act,
@@ -228,13 +231,14 @@ impl Layer<'_> {
             }
             return;
         }
-        map.clear();
+        let relu = self.rectified();
+        map.fill(zero_of(relu));
         if kernel > stride {
             let mut max = 0.0f32;
             for y in (0..lines).filter_map(|j| self.shape.source(rows.start, j)) {
                 max = larger(max, self.largest(y, 0..self.x.w));
             }
-            let (inverse, scale) = inverse_and_scale(max);
+            let (inverse, scale) = inverse_and_scale(max, relu);
             scales.fill(scale);
             for j in 0..lines {
                 if let Some(y) = self.shape.source(rows.start, j) {
@@ -257,7 +261,7 @@ impl Layer<'_> {
             for y in (j..j + kernel).filter_map(|j| self.shape.source(rows.start, j)) {
                 max = larger(max, self.largest(y, inside.clone()));
             }
-            let (inverse, s) = inverse_and_scale(max);
+            let (inverse, s) = inverse_and_scale(max, relu);
             *scale = s;
             for j in j..j + kernel {
                 if let Some(y) = self.shape.source(rows.start, j) {
@@ -274,13 +278,16 @@ impl Layer<'_> {
         &self.x.data[(y * self.x.w + xs.start) * self.x.c..(y * self.x.w + xs.end) * self.x.c]
     }
 
+    fn rectified(&self) -> bool {
+        self.conv.relu_input == Act::Relu
+    }
+
     fn largest(&self, y: usize, xs: Range<usize>) -> f32 {
-        self.ctx.kernels.largest(self.line(y, xs), self.conv.relu_input == Act::Relu)
+        self.ctx.kernels.largest(self.line(y, xs), self.rectified())
     }
 
     fn pixels(&self, y: usize, xs: Range<usize>, scale: MapScale, out: MapOut) {
-        let relu = self.conv.relu_input == Act::Relu;
-        self.ctx.kernels.to_map(ToMap { x: self.line(y, xs), c: self.x.c, relu, scale, out });
+        self.ctx.kernels.to_map(ToMap { x: self.line(y, xs), c: self.x.c, relu: self.rectified(), scale, out });
     }
 
     /// Every output of a band.
@@ -292,7 +299,7 @@ impl Layer<'_> {
         for panel in (0..weight.n.div_ceil(NR)).step_by(nv) {
             let panels = nv.min(weight.n.div_ceil(NR) - panel);
             let columns = ColumnsS8::of(*weight, (panel, panels), conv.bias, None);
-            let start = starts(kernel, *weight, panel, panels);
+            let start = starts(kernel, *weight, (panel, panels), zero_of(self.rectified()));
             let w = &weight.data[panel * w_stride..];
             let size = mr * NR * panels;
             let first = rows.start * shape.ow;

@@ -173,11 +173,22 @@ pub(crate) fn larger(a: f32, b: f32) -> f32 {
     if a.is_nan() || a > b { a } else { b }
 }
 
-/// (127 / max, max / 127) for values up to `max`; 0 and the scale 0 where that cannot be divided, 0 and NaN for NaN.
+/// The integer that stands for 0.0 in a map of rectified values, whose 255 steps all lie above it: half the step of a map
+/// with both signs, for no other instruction in the products.
+pub(crate) const RECTIFIED_ZERO: i8 = -128;
+
+/// The integer that stands for 0.0 in a map.
+pub(crate) fn zero_of(relu: bool) -> i8 {
+    if relu { RECTIFIED_ZERO } else { 0 }
+}
+
+/// (steps / max, max / steps) for values up to `max`, 127 steps, or 255 when they are rectified; 0 and the scale 0 where that cannot
+/// be divided, 0 and NaN for NaN.
 #[inline(always)]
-pub(crate) fn inverse_and_scale(max: f32) -> (f32, f32) {
-    let inverse = 127.0 / max;
-    if inverse.is_finite() { (inverse, max / 127.0) } else { (0.0, if max.is_nan() { max } else { 0.0 }) }
+pub(crate) fn inverse_and_scale(max: f32, relu: bool) -> (f32, f32) {
+    let steps = if relu { 255.0 } else { 127.0 };
+    let inverse = steps / max;
+    if inverse.is_finite() { (inverse, max / steps) } else { (0.0, if max.is_nan() { max } else { 0.0 }) }
 }
 
 /// Where quantized pixels go, in the form that an int8 kernel takes.
@@ -197,18 +208,18 @@ impl MapOut<'_> {
         }
     }
 
-    /// Zeros everywhere.
-    pub(crate) fn clear(&mut self) {
+    /// One value everywhere.
+    pub(crate) fn fill(&mut self, value: i8) {
         match self {
-            MapOut::Bytes(out, flip) => out.fill(*flip as i8),
-            MapOut::Wide(out) => out.fill(0),
+            MapOut::Bytes(out, flip) => out.fill(value ^ *flip as i8),
+            MapOut::Wide(out) => out.fill(i16::from(value)),
         }
     }
 }
 
 /// Steps of pixels that go into a map.
 pub(crate) enum MapScale<'a> {
-    /// 127 / max of all of them; 0 for zeros.
+    /// Steps / max of all of them ([`inverse_and_scale`]); 0 for zeros.
     Inverse(f32),
     /// Each pixel's own, to be written here.
     PerPixel(&'a mut [f32]),
@@ -220,7 +231,7 @@ pub(crate) struct ToMap<'a> {
     pub x: &'a [f32],
     /// Channels.
     pub c: usize,
-    /// Whether values are rectified first.
+    /// Whether values are rectified first, and so are counted from [`RECTIFIED_ZERO`] on.
     pub relu: bool,
     /// Their steps.
     pub scale: MapScale<'a>,
@@ -281,7 +292,7 @@ fn pixels<S: Simd, T: MapValue>(s: S, (x, c, relu): (&[f32], usize, bool), scale
         }
         MapScale::PerPixel(scales) => {
             for ((x, out), scale) in x.chunks_exact(c).zip(out.chunks_exact_mut(width)).zip(scales) {
-                let (inverse, step) = inverse_and_scale(largest_body(s, x, relu));
+                let (inverse, step) = inverse_and_scale(largest_body(s, x, relu), relu);
                 *scale = step;
                 quantize_run(s, x, relu, inverse, out, flip);
             }
@@ -289,12 +300,18 @@ fn pixels<S: Simd, T: MapValue>(s: S, (x, c, relu): (&[f32], usize, bool), scale
     }
 }
 
-/// Sixteen quantized values; an inverse of 0 gives zeros.
+/// Sixteen quantized values, round(v * inverse), or round(relu(v) * inverse - 128) rectified; an inverse of 0 gives zeros.
 #[inline(always)]
 fn quantized<S: Simd>(s: S, v: S::V, relu: bool, inverse: f32) -> [i8; LANES] {
-    let mut bytes = [0i8; LANES];
-    if inverse != 0.0 {
-        let v = if relu { relu_lanes(s, v) } else { v };
+    let mut bytes = [zero_of(relu); LANES];
+    if inverse == 0.0 {
+        return bytes;
+    }
+    if relu {
+        let v = relu_lanes(s, v).mul_add(s.splat(inverse), s.splat(f32::from(RECTIFIED_ZERO)));
+        let top = s.splat(127.0);
+        v.select_gt(top, top, v).store_s8(&mut bytes);
+    } else {
         clamp(s, v * s.splat(inverse)).store_s8(&mut bytes);
     }
     bytes

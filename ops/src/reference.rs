@@ -62,6 +62,21 @@ pub fn quantize(x: &[f32]) -> (Vec<i8>, f32) {
     (x.iter().map(|v| (v * inverse).clamp(-127.0, 127.0).round_ties_even() as i8).collect(), max / 127.0)
 }
 
+/// Values without a sign to 0..=255: m = max x, (round(x * (255 / m) - 128), at most 127, + 128, m / 255); with zeros and values that are
+/// not finite as in [`quantize`].
+fn quantize_rectified(x: &[f32]) -> (Vec<i32>, f32) {
+    if x.iter().any(|v| !v.is_finite()) {
+        return (vec![0; x.len()], f32::NAN);
+    }
+    let max = x.iter().fold(0.0f32, |m, v| m.max(*v));
+    let inverse = 255.0 / max;
+    if !inverse.is_finite() {
+        return (vec![0; x.len()], 0.0);
+    }
+    let level = |v: f32| v.mul_add(inverse, -128.0).min(127.0).round_ties_even() as i32 + 128;
+    (x.iter().map(|&v| level(v)).collect(), max / 255.0)
+}
+
 /// y_i = 1/sqrt(b) sum over j of (-1)^popcount(i & j) d_j x_j in each block of b values; d_j = -1 where bit j % 16 of
 /// `signs[j / 16]` is set.
 pub fn hadamard(x: &[f32], signs: &[u16], block: usize) -> Vec<f32> {
@@ -387,7 +402,7 @@ pub fn conv2d(x: Hwc, weight: &[f32], bias: Option<&[f32]>, window: Window) -> V
 }
 
 /// Convolution in integers, with the input scales of [`crate::conv_s8`]: `weight` `[out, in, kernel, kernel]` -> (sums `[oh, ow, out]`, the input
-/// scale of each output pixel `[oh, ow]`). With `relu` the input is rectified first.
+/// scale of each output pixel `[oh, ow]`). With `relu` the input is rectified first and has 255 steps.
 pub fn conv2d_s8(x: Hwc, weight: &[i8], window: Window, relu: bool) -> (Vec<i32>, Vec<f32>) {
     let Window { kernel, stride, pad } = window;
     let n = weight.len() / (x.c * kernel * kernel);
@@ -417,7 +432,12 @@ pub fn conv2d_s8(x: Hwc, weight: &[i8], window: Window, relu: bool) -> (Vec<i32>
                     values.extend(x.pixel(y, xx).iter().map(|&v| if relu { self::relu(v) } else { v }));
                 }
             }
-            let (q, scale) = quantize(&values);
+            let (q, scale) = if relu {
+                quantize_rectified(&values)
+            } else {
+                let (q, scale) = quantize(&values);
+                (q.into_iter().map(i32::from).collect(), scale)
+            };
             scales.push(scale);
             for o in 0..n {
                 let mut sum = 0;
@@ -430,7 +450,7 @@ pub fn conv2d_s8(x: Hwc, weight: &[i8], window: Window, relu: bool) -> (Vec<i32>
                     let at = ((y - ys.start) * xs.len() + xx - xs.start) * x.c;
                     for i in 0..x.c {
                         let w = weight[(o * x.c + i) * kernel * kernel + t];
-                        sum += i32::from(q[at + i]) * i32::from(w);
+                        sum += q[at + i] * i32::from(w);
                     }
                 }
                 sums.push(sum);

@@ -90,18 +90,14 @@ impl Layers<'_> {
         let f = self.head.features;
         let n = area(s) * f;
         let (x, hidden, out) = (&mut x[..n], &mut hidden[..n], &mut out[..n]);
-        let relu_input = match self.head.skip {
-            RcuSkip::Relu => {
-                relu(self.net.ctx, x);
-                Act::None
-            }
-            RcuSkip::Raw => Act::Relu,
-        };
+        if self.head.skip == RcuSkip::Relu {
+            relu(self.net.ctx, x);
+        }
         let x = Hwc::new(x, s.0, s.1, f);
-        let first = ConvLayer { act: Act::Relu, relu_input, ..ConvLayer::same(&unit.conv1, 3) };
+        let first = ConvLayer { act: Act::Relu, ..ConvLayer::same(&unit.conv1, 3).on_rectified() };
         self.net.conv(first, x, None, HwcMut::new(hidden, s.0, s.1, f));
         let hidden = Hwc::new(hidden, s.0, s.1, f);
-        self.net.conv(ConvLayer::same(&unit.conv2, 3), hidden, Some(x), HwcMut::new(out, s.0, s.1, f));
+        self.net.conv(ConvLayer::same(&unit.conv2, 3).on_rectified(), hidden, Some(x), HwcMut::new(out, s.0, s.1, f));
     }
 }
 
@@ -186,6 +182,6 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
     let to = HwcMut::new(hidden, d.height, d.width, head.hidden);
     net.conv(second, Hwc::new(full, d.height, d.width, half), None, to);
     let hidden = Hwc::new(hidden, d.height, d.width, head.hidden);
-    net.conv(ConvLayer::same(&head.last, 1), hidden, None, HwcMut::new(job.out, d.height, d.width, head.out));
+    net.conv(ConvLayer::same(&head.last, 1).on_rectified(), hidden, None, HwcMut::new(job.out, d.height, d.width, head.out));
     Ok(())
 }

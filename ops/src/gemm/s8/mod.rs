@@ -180,14 +180,21 @@ fn pack_block(ctx: Ctx, p: &Product, rows: std::ops::Range<usize>, packed: &mut 
     }
 }
 
-/// Where the sums of a group of panels start.
-pub(crate) fn starts(kernel: &GemmS8Kernel, w: PanelsS8, panel: usize, panels: usize) -> [[i32; NR]; MAX_NV] {
+/// Where the sums of a group of panels start, for activations whose integer `zero` stands for 0.0: so that sum (a - zero) w comes
+/// out, whether the kernel takes a or a + 128.
+pub(crate) fn starts(
+    kernel: &GemmS8Kernel,
+    w: PanelsS8,
+    (panel, panels): (usize, usize),
+    zero: i8,
+) -> [[i32; NR]; MAX_NV] {
     let mut start = [[0i32; NR]; MAX_NV];
-    if kernel.activations == Activations::Offset128 {
+    let offset = i32::from(zero) + if kernel.activations == Activations::Offset128 { 128 } else { 0 };
+    if offset != 0 {
         for (v, start) in start.iter_mut().enumerate().take(panels) {
             let col = (panel + v) * NR;
             for (s, sum) in start.iter_mut().zip(&w.col_sums[col..w.n.min(col + NR)]) {
-                *s = -128 * sum;
+                *s = -offset * sum;
             }
         }
     }
@@ -204,7 +211,7 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
         Sink::Values { ep, .. } => *ep,
     };
     let columns = ColumnsS8::of(p.w, (part.panel, part.panels), ep.bias, ep.gamma);
-    let start = starts(p.kernel, p.w, part.panel, part.panels);
+    let start = starts(p.kernel, p.w, (part.panel, part.panels), 0);
     let w = &p.w.data[part.panel * steps * STEP..];
     let size = mr * NR * part.panels;
     let block = STEPS / p.kernel.bytes;
