@@ -313,7 +313,9 @@ pub fn attention_s8(qkv: Mat, heads: usize, mask: FrameMask) -> (Vec<f32>, Vec<Q
                     let base2 = scale * std::f32::consts::LOG2_E;
                     let weights: Vec<u8> = t
                         .iter()
-                        .map(|t| {
+                        .enumerate()
+                        .map(|(j, t)| {
+                            let golden = (j * 40503 % 65536) as f32;
                             let floor = -20.0 / base2;
                             let x = t - tile_top;
                             let x = if floor > x { floor } else { x };
@@ -321,7 +323,8 @@ pub fn attention_s8(qkv: Mat, heads: usize, mask: FrameMask) -> (Vec<f32>, Vec<Q
                             let n = shifted - (ROUND + 127.0);
                             let r = x.mul_add(-base2, n);
                             let p = (-13.972_243f32).mul_add(r, 61.521_637).mul_add(r, -176.093_87).mul_add(r, 254.0);
-                            let y = p.mul_add(f32::from_bits(shifted.to_bits() << 23), ROUND - 127.0);
+                            let dither = (golden - 32768.0) / 66000.0;
+                            let y = p.mul_add(f32::from_bits(shifted.to_bits() << 23), dither) + (ROUND - 127.0);
                             (y - (ROUND - 127.0)) as u8
                         })
                         .collect();

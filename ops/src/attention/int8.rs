@@ -13,13 +13,14 @@
 //!
 //! ```text
 //! S = K q                      exact; score t = S * key scale
-//! top = max t;  P = round(254 e^((t - top) * query scale)), 0 to 254
+//! top = max t;  P = round(254 e^((t - top) * query scale) + dither), 0 to 254
 //! den = sum P;  N = V^T P      exact
 //! M' = max(M, top * query scale + shift);  w = e^(top .. - M'), k = e^(M - M')
 //! D = D k + den w;  O = O k + N * value scale * w
 //! ```
 //!
-//! and in the end O / D; a query that sees no key gives exactly 0. The mean key of a frame moves all scores of a query with
+//! and in the end O / D. The dither of a key is a constant of its place in the tile, so that small weights keep their sum
+//! instead of vanishing (`softmax::DITHER`). A query that sees no key gives exactly 0. The mean key of a frame moves all scores of a query with
 //! the keys of that frame by q . mean, which is added back as the shift of that frame, in f32 and from the query before it was
 //! quantized. A query that sees one frame needs no shift: its softmax does not change when all its scores move. So a result
 //! depends on visible frames only, and a frame is packed the same way whatever stands beside it.

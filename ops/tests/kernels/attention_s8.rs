@@ -49,6 +49,26 @@ fn check(mask: FrameMask, heads: usize, d: usize, spread: f32) {
     });
 }
 
+/// One key far above many whose weights are below half a step each: what they say together must not be lost.
+#[test]
+fn small_weights_keep_their_sum() {
+    let (tokens, d) = (128, 16);
+    // Every query meets key 0 with a score of ln 850, the others with 0: weights 254 and 0.3, 127 of which make 13 % of all.
+    let mut x = vec![0.0f32; tokens * 3 * d];
+    for (i, row) in x.chunks_mut(3 * d).enumerate() {
+        row[0] = 4.0;
+        row[d] = if i == 0 { 850f32.ln() } else { 0.0 };
+        row[2 * d..].fill(if i == 0 { -1.0 } else { 1.0 });
+    }
+    let expected = (127.0 - 850.0) / (127.0 + 850.0);
+    everywhere(|ctx, name| {
+        let y = run(ctx, plain(Mat::new(&x, tokens, 3 * d), 1), mask(1, tokens, 0, 0), name);
+        for v in y {
+            assert!((v - expected).abs() < 0.03, "{name}: {v} instead of {expected}");
+        }
+    });
+}
+
 fn mask(frames: usize, tokens: usize, lo: i32, hi: i32) -> FrameMask {
     FrameMask { frames, tokens, lo, hi }
 }

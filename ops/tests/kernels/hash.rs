@@ -227,7 +227,7 @@ fn one_hash_on_every_architecture() {
         ("layernorm", 0xdb34_e22b_c977_8941),
         ("rope", 0xa9fc_176d_24de_7e1c),
         ("attention", 0x60ab_c85b_fb17_8428),
-        ("attention_s8", 0x5416_126b_410f_512a),
+        ("attention_s8", 0xad28_4c77_377a_95a1),
         ("int8", 0x597a_8bfe_864f_0bf8),
         ("conv_s8", 0x4085_a0d9_fe30_f4c1),
         ("conv2d", 0x5dd3_78aa_c81e_9282),
