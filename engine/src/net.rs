@@ -7,7 +7,7 @@
 use crate::arena::Arena;
 use crate::model::{Linear, Model, Norm, PanelRef, VecRef, Weight};
 use sf_formats::Result;
-use sf_ops::conv::{self, Conv, ConvTranspose};
+use sf_ops::conv::{self, Conv, ConvTranspose, conv_out};
 use sf_ops::conv_s8::{self, ConvS8, ConvTransposeS8};
 use sf_ops::cpu::Ctx;
 use sf_ops::gemm::{Act, Epilogue, PanelsS8, RowsS8, RowsS8Mut, gemm, gemm_s8, gemm_s8_quantize, padded_k};
@@ -57,7 +57,7 @@ pub(crate) fn is_pair(first: &PanelRef, second: &PanelRef) -> bool {
     first.is_int8() && second.is_int8() && first.n <= PAIR
 }
 
-/// Who looks at the input rows of linear layers, by the number of the weight's tensor.
+/// Who looks at the input rows of layers, by the number of the weight's tensor.
 pub(crate) type Seen<'a> = &'a dyn Fn(usize, &[f32]);
 
 /// Weights and the machine to run them on.
@@ -66,7 +66,7 @@ pub(crate) struct Net<'a> {
     pub(crate) ctx: Ctx<'a>,
     pub(crate) model: &'a Model,
     pub(crate) rows: &'a Rows,
-    /// Who looks at the input rows of linear layers; the number is that of the weight's tensor.
+    /// Who looks at the input rows of layers; the number is that of the weight's tensor.
     pub(crate) seen: Option<Seen<'a>>,
 }
 
@@ -92,12 +92,41 @@ impl<'a> ConvLayer<'a> {
     }
 }
 
+/// Windows of one image that are shown, at most: neighbours say much the same.
+const WINDOWS: usize = 1024;
+
+/// Shows windows of a convolution's input, `[ky][kx][in]`, rectified where the layer does that: those of every third output line and
+/// column, or farther apart in large images. Three, because patches are 14 or 7 pixels wide: every place in a patch comes in turn.
+fn windows(x: Hwc, (kernel, stride, pad): (usize, usize, usize), relu: Act, seen: &dyn Fn(&[f32])) {
+    let (oh, ow) = (conv_out(x.h, kernel, stride, pad), conv_out(x.w, kernel, stride, pad));
+    let step = (3..).step_by(2).find(|s| oh.div_ceil(*s) * ow.div_ceil(*s) <= WINDOWS).unwrap_or(3);
+    let mut row = vec![0.0; kernel * kernel * x.c];
+    for oy in (0..oh).step_by(step) {
+        for ox in (0..ow).step_by(step) {
+            row.fill(0.0);
+            for (tap, to) in row.chunks_exact_mut(x.c).enumerate() {
+                let (y, xx) = (oy * stride + tap / kernel, ox * stride + tap % kernel);
+                if (pad..x.h + pad).contains(&y) && (pad..x.w + pad).contains(&xx) {
+                    to.copy_from_slice(x.pixel(y - pad, xx - pad));
+                }
+            }
+            if relu == Act::Relu {
+                row.iter_mut().for_each(|v| *v = v.max(0.0));
+            }
+            seen(&row);
+        }
+    }
+}
+
 impl Net<'_> {
     /// out = act(conv(x)) + residual, padded by half the kernel.
     pub(crate) fn conv(&self, layer: ConvLayer, x: Hwc, residual: Option<Hwc>, out: HwcMut) {
         let ConvLayer { weights, kernel, stride, act, relu_input } = layer;
         let bias = weights.bias.map(|b| self.model.values(b));
         let pad = kernel / 2;
+        if let Some(seen) = self.seen {
+            windows(x, (kernel, stride, pad), relu_input, &|row| seen(weights.weight.tensor, row));
+        }
         match self.model.weight(&weights.weight) {
             Weight::Float(weight) => {
                 conv::conv2d(self.ctx, x, &Conv { weight, bias, kernel, stride, pad, relu_input, act }, residual, out);

@@ -200,8 +200,8 @@ impl Session {
     }
 
     /// [`Session::run`] with a function that sees the input rows of every linear layer whose inputs exist as floats, all of
-    /// them in an f32 or f16 model, with the name of the weight: what the rounding of weights is calibrated with.
-    /// Convolutions are not shown.
+    /// them in an f32 or f16 model, and windows of every convolution (`[ky][kx][in]`, up to 1,024 of an image), with the name of
+    /// the weight: what the rounding of weights is calibrated with. Transposed convolutions and the patch embedding are not shown.
     pub fn run_observed(&mut self, input: &Input, seen: &dyn Fn(&str, &[f32])) -> Result<&Output> {
         let names = self.model.names();
         self.run_seen(input, None, None, Some(&|tensor: usize, row: &[f32]| seen(&names[tensor], row)))

@@ -126,8 +126,8 @@ pub fn quantize(
     let width = rotated_width(spec).expect("a matrix has inputs");
     assert!(!rotated || rotation_block(width).is_some(), "a rotation of the inputs of {} {:?}", spec.name, spec.shape);
     let signs = if rotated { signs(width) } else { Vec::new() };
-    // Only linear layers are observed, whose inputs are as wide as the matrix.
-    let metric = calibration.filter(|_| k == width).and_then(|c| c.metric(&spec.name, fold, &signs));
+    // What is rotated is seen before the rotation, which a convolution's window of many pixels would need for each of them.
+    let metric = calibration.filter(|_| k == width || !rotated).and_then(|c| c.metric(&spec.name, fold, &signs));
     let (mut out, mut scales) = (vec![0i8; n * k], vec![0.0f32; n]);
     let sums: Vec<(f64, f64, f64)> = (out.par_chunks_exact_mut(k), scales.par_iter_mut())
         .into_par_iter()
