@@ -101,16 +101,20 @@ impl Calibration {
         sha256(&all)
     }
 
+    /// Mean input of the matrix `weight` without the gain and offset in `fold`; none for a layer that was not seen.
+    pub(crate) fn mean(&self, weight: &str, fold: &Fold) -> Option<Vec<f32>> {
+        let m = self.layers.get(weight)?;
+        let inverse = inverse_gains(fold, m.sum.len());
+        let mean = m.sum.iter().enumerate().map(|(i, s)| (s / m.rows as f64 - at(&fold.offset, i, 0.0)) * inverse[i]);
+        Some(mean.map(|v| v as f32).collect())
+    }
+
     /// What rounding the matrix `weight` needs to know, for inputs with `fold` taken out and rotated by `signs`; none for
     /// a layer that was not seen.
     pub(crate) fn metric(&self, weight: &str, fold: &Fold, signs: &[u16]) -> Option<Metric> {
         let m = self.layers.get(weight)?;
         let (k, n) = (m.sum.len(), m.rows as f64);
-        let at = |v: &Option<Vec<f32>>, i: usize, otherwise: f64| v.as_ref().map_or(otherwise, |v| f64::from(v[i]));
-        // The norm's gain and offset are in the weights: inputs are those before them. An input of no gain does nothing.
-        let gains: Vec<f64> = (0..k).map(|i| at(&fold.gain, i, 1.0)).collect();
-        let least = 1e-6 * gains.iter().fold(0.0f64, |m, g| m.max(g.abs()));
-        let inverse: Vec<f64> = gains.iter().map(|g| if g.abs() > least { 1.0 / g } else { 0.0 }).collect();
+        let inverse = inverse_gains(fold, k);
         let mean: Vec<f64> = m.sum.iter().map(|s| s / n).collect();
         let mut folded: Vec<f64> = (0..k).map(|i| (mean[i] - at(&fold.offset, i, 0.0)) * inverse[i]).collect();
         let mut c = vec![0.0; k * k];
@@ -133,6 +137,19 @@ impl Calibration {
         (0..k).for_each(|i| c[i * k + i] += DAMPING * spread);
         cholesky(&mut c, k).then_some(Metric { mean: folded, r: c })
     }
+}
+
+/// Value `i` of a vector, or what stands for one that is not there.
+fn at(v: &Option<Vec<f32>>, i: usize, otherwise: f64) -> f64 {
+    v.as_ref().map_or(otherwise, |v| f64::from(v[i]))
+}
+
+/// 1 / gain of `k` inputs: the norm's gain and offset are in the weights, and inputs are those before them. An input of no gain does
+/// nothing.
+fn inverse_gains(fold: &Fold, k: usize) -> Vec<f64> {
+    let gains: Vec<f64> = (0..k).map(|i| at(&fold.gain, i, 1.0)).collect();
+    let least = 1e-6 * gains.iter().fold(0.0f64, |m, g| m.max(g.abs()));
+    gains.iter().map(|g| if g.abs() > least { 1.0 / g } else { 0.0 }).collect()
 }
 
 fn transpose(c: &mut [f64], k: usize) {

@@ -210,11 +210,17 @@ enum Fate {
     Plain,
     /// Folded into others: stored as ones or zeros.
     Neutral(f32),
-    /// A matrix that takes vectors in; where those come from.
-    Folded(Vec<(Part, (Origin, usize))>),
+    /// A norm's offset, folded into the matrices that read the norm. Where its gain and offset come from, and which matrix's inputs
+    /// give the mean that it takes off instead.
+    Centring(Vec<Folded>, usize),
+    /// A matrix that takes vectors in; where those come from, and which matrix's inputs give the mean that the norm takes off.
+    Folded(Vec<Folded>, Option<usize>),
     /// The bias of the matrix before, folded with it.
     FoldedBias,
 }
+
+/// A vector of a [`Fold`], and where it comes from.
+type Folded = (Part, (Origin, usize));
 
 /// Which vector of a [`Fold`].
 #[derive(Clone, Copy)]
@@ -303,6 +309,13 @@ fn prepare(source: &dyn Checkpoint, at: &str, options: &Options) -> Result<(Repo
 
 /// What the folding does to tensor `i`.
 fn fate(folding: &Folding, from: &[(Origin, usize)], i: usize) -> Fate {
+    let parts = |Sources { gain, offset, gamma, .. }: &Sources| {
+        let parts = [(Part::Gain, gain), (Part::Offset, offset), (Part::Gamma, gamma)];
+        parts.into_iter().filter_map(|(part, at)| at.map(|at| (part, from[at]))).collect()
+    };
+    if let Some(&first) = folding.offset_of.get(&i) {
+        return Fate::Centring(parts(&Sources { gamma: None, ..folding.into[&first].clone() }), first);
+    }
     if let Some(&value) = folding.neutral.get(&i) {
         return Fate::Neutral(value);
     }
@@ -310,10 +323,7 @@ fn fate(folding: &Folding, from: &[(Origin, usize)], i: usize) -> Fate {
         return Fate::FoldedBias;
     }
     match folding.into.get(&i) {
-        Some(Sources { gain, offset, gamma }) => {
-            let parts = [(Part::Gain, gain), (Part::Offset, offset), (Part::Gamma, gamma)];
-            Fate::Folded(parts.into_iter().filter_map(|(part, at)| at.map(|at| (part, from[at]))).collect())
-        }
+        Some(sources) => Fate::Folded(parts(sources), sources.first),
         None => Fate::Plain,
     }
 }
@@ -507,7 +517,7 @@ fn stream(
         let (send, receive) = sync_channel::<Result<Loaded>>(0);
         let read = move || {
             for job in jobs {
-                let values = load_with_parts((source, at), neutral, job);
+                let values = load_with_parts((source, at), neutral, (jobs, job), options.calibration.as_deref());
                 let failed = values.is_err();
                 if send.send(values).is_err() || failed {
                     return;
@@ -531,7 +541,7 @@ fn stream(
                         last.as_ref().ok_or_else(|| Error::Internal(format!("no matrix before {}", row.name)))?;
                     loaded.values = quantize::folded_bias(spec, &weight.values, &weight.fold, &loaded.values);
                 }
-                Fate::Folded(_) | Fate::Plain => {}
+                Fate::Folded(..) | Fate::Centring(..) | Fate::Plain => {}
             }
             if let Some((_, shift)) =
                 shift.take().filter(|(layer, _)| job.spec.name.strip_suffix("bias") == Some(layer))
@@ -547,7 +557,7 @@ fn stream(
                     row.sqnr_db = Some(float_sqnr(&loaded.values, row.dtype));
                 }
             }
-            last = matches!(job.fate, Fate::Folded(_)).then_some((&job.spec, loaded));
+            last = matches!(job.fate, Fate::Folded(..)).then_some((&job.spec, loaded));
         }
         if int8 {
             let table = report.tensors.iter().filter_map(|t| t.sqnr_db).map(|db| (db * 100.0).round() / 100.0);
@@ -599,18 +609,42 @@ fn float_sqnr(values: &[f32], dtype: Dtype) -> f64 {
     sqnr_db(signal, noise)
 }
 
-/// The values of one tensor and of what is folded into it.
-fn load_with_parts((source, at): (&dyn Checkpoint, &str), neutral: &Seeded, job: &Job) -> Result<Loaded> {
+/// The values of one tensor and of what is folded into it, around the mean where the calibration has seen it.
+fn load_with_parts(
+    (source, at): (&dyn Checkpoint, &str),
+    neutral: &Seeded,
+    (jobs, job): (&[Job], &Job),
+    calibration: Option<&Calibration>,
+) -> Result<Loaded> {
     let mut loaded = Loaded { values: load((source, at), neutral, job)?, fold: Fold::default() };
-    if let Fate::Folded(parts) = &job.fate {
-        for (part, from) in parts {
-            let values = Some(read((source, at), neutral, *from)?);
-            match part {
-                Part::Gain => loaded.fold.gain = values,
-                Part::Offset => loaded.fold.offset = values,
-                Part::Gamma => loaded.fold.gamma = values,
+    let (parts, reader) = match &job.fate {
+        Fate::Folded(parts, first) => (parts, *first),
+        Fate::Centring(parts, first) => (parts, Some(*first)),
+        _ => return Ok(loaded),
+    };
+    let fold = &mut loaded.fold;
+    for (part, from) in parts {
+        let values = Some(read((source, at), neutral, *from)?);
+        match part {
+            Part::Gain => fold.gain = values,
+            Part::Offset => fold.offset = values,
+            Part::Gamma => fold.gamma = values,
+        }
+    }
+    // What the norm gives without its gain and offset, on average.
+    let mean = calibration.zip(reader).and_then(|(c, reader)| c.mean(&jobs[reader].spec.name, fold));
+    match (&job.fate, mean) {
+        (Fate::Centring(..), mean) => {
+            loaded.values.fill(0.0);
+            loaded.values.iter_mut().zip(mean.iter().flatten()).for_each(|(v, m)| *v = -m);
+        }
+        // gain x + offset = gain (x - mean) + (offset + gain mean).
+        (_, Some(mean)) => {
+            if let Fold { gain: Some(gain), offset: Some(offset), .. } = fold {
+                offset.iter_mut().zip(gain.iter().zip(mean)).for_each(|(o, (g, m))| *o = g.mul_add(m, *o));
             }
         }
+        _ => {}
     }
     Ok(loaded)
 }

@@ -12,7 +12,8 @@
 //!
 //! Folding ([`Sources`]) concerns int8 matrices: a norm's gain and offset go into every matrix that reads it when all
 //! of them are int8, a layer scale into the matrix in front. The norm and the scale stay in the file as ones
-//! and zeros, so that the network is the same for every reader.
+//! and zeros, so that the network is the same for every reader. With a calibration the norm's offset is minus its mean value
+//! instead, and the matrices' biases make up for it: tokens around zero have smaller steps.
 
 use crate::convert::SCAN_REASON;
 use crate::names::glob;
@@ -114,6 +115,8 @@ pub(crate) struct Sources {
     pub(crate) gain: Option<usize>,
     pub(crate) offset: Option<usize>,
     pub(crate) gamma: Option<usize>,
+    /// The first matrix that reads the same norm: whose observed inputs give the mean.
+    pub(crate) first: Option<usize>,
 }
 
 /// What becomes of every tensor beside its type.
@@ -125,6 +128,8 @@ pub(crate) struct Folding {
     pub(crate) bias_of: BTreeMap<usize, usize>,
     /// Vectors that are stored as ones (gains, layer scales) or zeros (offsets).
     pub(crate) neutral: BTreeMap<usize, f32>,
+    /// Offset of a norm to the first matrix that reads it.
+    pub(crate) offset_of: BTreeMap<usize, usize>,
 }
 
 /// Plans the folding for the chosen types.
@@ -144,9 +149,11 @@ pub(crate) fn fold(specs: &[TensorSpec], choices: &[Choice]) -> Folding {
                 }
                 folding.neutral.insert(i, 1.0);
                 folding.neutral.extend(offset.map(|o| (o, 0.0)));
+                let first = readers.first().copied();
+                folding.offset_of.extend(offset.zip(first));
                 for r in readers {
                     let into = folding.into.entry(r).or_default();
-                    (into.gain, into.offset) = (Some(i), offset);
+                    (into.gain, into.offset, into.first) = (Some(i), offset, offset.and(first));
                 }
             }
             Role::LayerScale => {
