@@ -1,9 +1,12 @@
 //! Which layers int8 is too coarse for: the sensitivity scan of `convert --check`.
 //!
-//! When an int8 model misses its gates, every int8 layer (every block in networks of more than [`MAX_SINGLE`] layers) is
-//! set to f16 by itself, and so is the attention of every stack of blocks; what the gates gain is measured. Then these
-//! candidates become f16 in the order of gain per multiply-add until the gates pass, up to [`BUDGET`] of the multiply-adds.
-//! One that no longer gains beside those before it is left as it was: errors of several layers cancel as it happens.
+//! When an int8 model misses its gates, every int8 layer (every block in networks of more than [`MAX_SINGLE`] layers), and the attention of
+//! every stack of blocks, is the only int8 part of the network for once, everything else being f16: the error that it makes. Then
+//! these candidates become f16 in the order of squared error per multiply-add until the gates pass, up to [`BUDGET`] of the
+//! multiply-adds.
+//!
+//! Squared errors of parts add up, as long as each is measured alone. What an int8 network gains when one part becomes f16 is another
+//! thing: beside the part's own error it holds twice its product with all the others', which is larger and has any sign.
 
 use crate::args::EngineArgs;
 use crate::model::{Scratch, scratch_folder};
@@ -26,6 +29,8 @@ use streetforward::Model;
 const MAX_SINGLE: usize = 120;
 /// Largest share of the multiply-adds that may be promoted.
 pub(crate) const BUDGET: f64 = 0.05;
+/// Share of a gate's bound from which on it counts.
+const PRESSED: f64 = 0.5;
 
 /// A checkpoint, its f32 model's answers, and the means to judge other forms of it.
 pub(crate) struct Judge<'a> {
@@ -81,31 +86,29 @@ impl<'a> Judge<'a> {
             return Ok(Vec::new());
         }
         console.note(format!("int8 misses {}: scanning its layers", versus::failures(gates, &verdict).join("; ")));
-        let start = excess(gates, &verdict);
+        // What is far from its bound need not get better.
+        let pressed: Vec<Gate> = gates.iter().filter(|g| g.load(&verdict.outputs) > PRESSED).cloned().collect();
         let mut candidates = candidates(&report);
+        let all: Vec<&String> = report.tensors.iter().filter(|t| t.dtype == Dtype::Int8).map(|t| &t.name).collect();
         let progress = console.progress(candidates.len() as u64, "scan");
         for c in &mut candidates {
-            let alone = Options { promoted: c.names.clone(), ..options.clone() };
-            c.gain = start - excess(gates, &self.trial(&alone)?.0);
+            let others = all.iter().filter(|n| !c.names.contains(n)).map(|n| n.to_string()).collect();
+            let alone = Options { promoted: others, ..options.clone() };
+            c.error = squared(&pressed, &self.trial(&alone)?.0);
             progress.step();
         }
         drop(progress);
-        candidates.sort_by(|a, b| (b.gain / b.share).total_cmp(&(a.gain / a.share)));
+        candidates.sort_by(|a, b| (b.error / b.share).total_cmp(&(a.error / a.share)));
         let work = Work::of(&report.config);
         let mut promoted: Vec<String> = Vec::new();
-        let mut left = start;
-        for c in candidates.iter().filter(|c| c.gain > 0.0) {
+        for c in &candidates {
             let mut more = promoted.clone();
             more.extend(c.names.iter().filter(|n| !promoted.contains(n)).cloned());
             if more.len() == promoted.len() || work.share(&more) > BUDGET {
                 continue;
             }
-            let found = self.trial(&Options { promoted: more.clone(), ..options.clone() })?.0;
-            let after = excess(gates, &found);
-            if after >= left {
-                continue;
-            }
-            (promoted, verdict, left) = (more, found, after);
+            promoted = more;
+            verdict = self.trial(&Options { promoted: promoted.clone(), ..options.clone() })?.0;
             console.note(format!(
                 "{} as f16 ({:.2} % of the work): {:.3}",
                 c.label,
@@ -132,11 +135,12 @@ struct Candidate {
     names: Vec<String>,
     /// Of all multiply-adds.
     share: f64,
-    gain: f64,
+    /// Sum of the squared loads with nothing else in int8.
+    error: f64,
 }
 
 /// Sum of the squared loads: errors of independent layers add in it.
-fn excess(gates: &[Gate], verdict: &Verdict) -> f64 {
+fn squared(gates: &[Gate], verdict: &Verdict) -> f64 {
     gates.iter().map(|g| g.load(&verdict.outputs).powi(2)).sum()
 }
 
@@ -160,7 +164,7 @@ fn candidates(report: &Report) -> Vec<Candidate> {
     // That of a single block is a layer of its own.
     groups.extend(stacks.into_iter().filter(|(_, names)| names.len() > 1));
     let candidate =
-        |(label, names): (String, Vec<String>)| Candidate { label, share: work.share(&names), names, gain: 0.0 };
+        |(label, names): (String, Vec<String>)| Candidate { label, share: work.share(&names), names, error: 0.0 };
     groups.into_iter().map(candidate).collect()
 }
 
