@@ -14,8 +14,9 @@ use sf_formats::{Camera, Error, Result};
 use crate::bin::{self, GROUPS, KeyForm};
 use crate::blend::{Channels, Shared};
 use crate::blend_back::{BlendBack, History, ImageGradients, SUMS, SharedBack, Slot};
-use crate::project::{Projector, TILE};
+use crate::project::Projector;
 use crate::render::{Renderer, lock, place, read};
+use crate::screen::TILE;
 
 /// dL/d of the Gaussians' fields, in the order of the scene, and of the view. All zero for a Gaussian that is not seen.
 #[derive(Clone, Debug, Default, PartialEq)]

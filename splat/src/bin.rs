@@ -13,7 +13,9 @@ use sf_formats::scene::Gaussians;
 use sf_ops::Kernels;
 use sf_ops::simd::{Body, Simd};
 
-use crate::project::{Counts, Project, Projector, Rect, Seen};
+use crate::project::{Counts, Projector};
+use crate::project_lanes::Project;
+use crate::screen::{Rect, Seen};
 
 /// Number of runs the scene is cut into. Fixed, not the number of threads.
 pub const GROUPS: usize = 16;

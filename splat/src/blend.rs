@@ -20,7 +20,7 @@ use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::{self, KeyForm};
 use crate::math::exp2_neg;
-use crate::project::{BLOCK, Record, Rect, Seen, TILE, X_CUT};
+use crate::screen::{BLOCK, Record, Rect, Seen, TILE, X_CUT};
 
 /// A pixel is finished when its next T would be at or below this.
 pub const T_STOP: f32 = 1e-4;

@@ -22,7 +22,7 @@ use sf_ops::simd::{Body, LANES, Simd, Vector};
 
 use crate::bin::GROUPS;
 use crate::blend::{BLOCKS, CHUNK, Draw, Line, PER_ROW, Place, Shared, Shown, Tile, columns_rows};
-use crate::project::BLOCK;
+use crate::screen::BLOCK;
 
 /// Sums of one Gaussian over pixels: h, h d, h d d, h e, h d e, h e e, then w dL/dred, w dL/dgreen, w dL/dblue, w dL/dD.
 pub(crate) const SUMS: usize = 10;

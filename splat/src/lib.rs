@@ -3,7 +3,9 @@
 //! | file | what |
 //! |---|---|
 //! | `math.rs` | exp2, log2 and ln from own polynomials: the same bits on every CPU |
-//! | `project.rs` | Gaussians -> screen [`project::Record`]s, sixteen at a time: culling, covariance, antialiasing |
+//! | `screen.rs` | a [`screen::Record`], and the tiles and blocks that it meets |
+//! | `project.rs` | Gaussians -> records: culling, covariance, antialiasing, one at a time in f64 |
+//! | `project_lanes.rs` | the same sixteen at a time in f32 where that is enough |
 //! | `bin.rs` | records -> one list of `depth, record, blocks` keys per 32x32 tile |
 //! | `blend.rs` | one tile front to back: lazy depth buckets, lists per 4x4 block, state in registers |
 //! | `render.rs` | [`Renderer`]: memory, threads, output images |
@@ -35,9 +37,11 @@ mod blend_back;
 pub mod math;
 pub mod project;
 mod project_back;
+pub mod project_lanes;
 pub mod reference;
 pub mod reference_grad;
 pub mod render;
+pub mod screen;
 
 pub use backward::Gradients;
 pub use blend_back::ImageGradients;

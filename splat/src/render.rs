@@ -16,7 +16,8 @@ use sf_ops::simd::{Body, LANES, Simd, Vector};
 use crate::backward::{Back, Drawn};
 use crate::bin::{self, GROUPS, Group, KeyForm};
 use crate::blend::{Blend, Channels, Place, Shared, Tile};
-use crate::project::{self, BLOCK, Counts, Projector, TILE};
+use crate::project::{self, Counts, Projector};
+use crate::screen::{BLOCK, TILE};
 
 /// Further values per Gaussian, composited like colour but without a background: velocity, dynamic
 /// probability, class scores.

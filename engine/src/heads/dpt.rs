@@ -182,6 +182,11 @@ pub(crate) fn frame(net: Net, head: &Dpt, tables: &DptTables, d: &Dims, job: Pyr
     let to = HwcMut::new(hidden, d.height, d.width, head.hidden);
     net.conv(second, Hwc::new(full, d.height, d.width, half), None, to);
     let hidden = Hwc::new(hidden, d.height, d.width, head.hidden);
-    net.conv(ConvLayer::same(&head.last, 1).on_rectified(), hidden, None, HwcMut::new(job.out, d.height, d.width, head.out));
+    net.conv(
+        ConvLayer::same(&head.last, 1).on_rectified(),
+        hidden,
+        None,
+        HwcMut::new(job.out, d.height, d.width, head.out),
+    );
     Ok(())
 }
