@@ -4,7 +4,7 @@
 #
 #   scripts/test-html.sh [PAGE]
 #
-# Without PAGE a street with exact ground truth is drawn, exported and opened (the built binary is
+# Without PAGE a street with exact ground truth is drawn, exported and opened, and then the page of `demo` (the built binary is
 # target/release/streetforward, or $STREETFORWARD). The page itself compares: `#check` draws every picture of its strip
 # again, at source times, between and beyond them, and takes the PSNR against the one that our rasterizer drew when the
 # page was made. Both went through JPEG or 8 bits, so 38 dB is the most that can be expected; 32 is asked for.
@@ -83,3 +83,9 @@ open_page '#bench=10' 640,480 --dump-dom >"$out/bench.html"
 echo "bench  $(report "$out/bench.html")"
 echo "size   $(wc -c <"$page") bytes"
 echo "screenshots and logs: $out"
+
+# A predicted street as well: every frame has a focal length of its own there.
+if [ $# -eq 0 ]; then
+    "$binary" demo -q -o "$out/demo" --force >/dev/null
+    OUT=$out/demo-page scripts/test-html.sh "$out/demo/street.html"
+fi

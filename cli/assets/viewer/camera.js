@@ -47,13 +47,14 @@ function between(a, b, s) {
   return { turn: turnOf(unit(p.map((x, i) => u * x + v * q[i]))), centre: plus(a.centre, plus(b.centre, a.centre, -1), s) };
 }
 
-/** The source camera at a time, interpolated and carried on. */
+/** The source camera at a time: its place interpolated and carried on, with the lens of the nearer frame. */
 function cameraAt(frames, time) {
   if (frames.length === 1) return frames[0];
   let hi = frames.findIndex(f => f.time >= time);
   hi = Math.max(1, hi < 0 ? frames.length - 1 : hi);
   const [a, b] = [frames[hi - 1], frames[hi]];
-  return between(a, b, (time - a.time) / (b.time - a.time));
+  const s = (time - a.time) / (b.time - a.time);
+  return { ...(s < 0.5 ? a : b), ...between(a, b, s) };
 }
 
 /** The lens of a source frame for a picture of another size: it fills the picture. */

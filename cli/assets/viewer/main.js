@@ -214,7 +214,9 @@ function start() {
   const view = () => {
     const { width, height } = canvas;
     const pose = state.ride ? cameraAt(info.frames, state.time) : rig;
-    return { camera: { turn: pose.turn, centre: pose.centre, lens: lensFor(info.frames[0], width, height) }, ...state };
+    // Every frame may have a focal length of its own, as predicted: riding along shows what was drawn there.
+    const lens = lensFor(state.ride ? pose : info.frames[0], width, height);
+    return { camera: { turn: pose.turn, centre: pose.centre, lens }, ...state };
   };
   const fit = () => {
     const ratio = Math.min(2, devicePixelRatio || 1);

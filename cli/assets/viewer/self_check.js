@@ -8,13 +8,13 @@ function psnr(a, b) {
   return sum ? 10 * Math.log10(255 ** 2 / (sum / (0.75 * a.length))) : 99;
 }
 
-/** Draws at a source frame's size into memory, rows from the top. */
+/** Draws at a source frame's size into memory, rows from the top; a view is a source camera with its lens. */
 function shoot(drawer, view, size) {
   const { gl } = drawer, { width, height } = size;
   const target = gl.createFramebuffer(), t = texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE, null);
   gl.bindFramebuffer(gl.FRAMEBUFFER, target);
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, t, 0);
-  const camera = { turn: view.turn, centre: view.centre, lens: lensFor(size, width, height) };
+  const camera = { turn: view.turn, centre: view.centre, lens: lensFor(view, width, height) };
   const show = { still: true, moving: true };
   drawer.draw({ camera, time: view.time, mode: view.mode || 'rgb', grow: 1, show }, { width, height, ground: [0, 0, 0] });
   const raw = new Uint8Array(4 * width * height), upright = new Uint8Array(raw.length);
