@@ -1,35 +1,15 @@
 //! What a calibration changes in a blob beside the rounding of weights.
 
 use sf_formats::checkpoint::Checkpoint;
-use sf_formats::config::{Head, ModelConfig, Trunk};
 use sf_formats::{Blob, Dtype};
 use sf_quant::{Calibration, Options, Outputs, Seeded, convert_to_bytes};
 use std::sync::Arc;
 
+mod common;
+use common::small;
+
 const LAYER: &str = "encoder.blocks.0.attn.qkv";
 const NORM: &str = "encoder.blocks.0.norm1";
-
-fn config() -> ModelConfig {
-    let trunk = Trunk { dim: 64, depth: 1, heads: 1, registers: 2, mlp_ratio: 2, eps: 1e-6 };
-    ModelConfig {
-        patch: 4,
-        encoder: trunk.clone(),
-        pos_grid: 3,
-        aa: Trunk { depth: 8, heads: 2, registers: 5, ..trunk },
-        camera_dim: 64,
-        camera_depth: 1,
-        camera_heads: 1,
-        camera_width: 32,
-        depth: Head::xdec_linear(3, 64, 1, 1),
-        conf: Head::none(),
-        gs: Head::dpt(11, [0, 1, 2, 3], [4, 8, 12, 16], 8),
-        time_dim: 16,
-        causal_depth: 4,
-        causal_heads: 2,
-        motion: Head::dpt(4, [0, 1, 2, 3], [4, 8, 12, 16], 8),
-        ..ModelConfig::full()
-    }
-}
 
 fn values(blob: &Blob, name: &str) -> Vec<f32> {
     let mut values = Vec::new();
@@ -40,7 +20,7 @@ fn values(blob: &Blob, name: &str) -> Vec<f32> {
 /// A norm gives its tokens around zero, and the bias behind it has the mean: the network is the same.
 #[test]
 fn norms_take_the_mean_off_and_biases_put_it_back() {
-    let source = Seeded::new(&config(), 3, Outputs::Random).unwrap();
+    let source = Seeded::new(&small(), 3, Outputs::Random).unwrap();
     let read = |name: &str| {
         let mut values = Vec::new();
         let at = source.tensors().iter().position(|t| t.name == name).unwrap_or_else(|| panic!("no {name}"));

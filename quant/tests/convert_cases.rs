@@ -13,6 +13,9 @@ use sf_quant::{
 };
 use std::path::{Path, PathBuf};
 
+mod common;
+use common::small;
+
 /// The cases covered here. Reading formats (c08 to c10) belongs to `formats`, killed writers (c14) to its
 /// atomic files, calibration and accuracy gates (c15, c16, c18) to int8.
 pub const CASES: [&str; 11] = ["c01", "c02", "c03", "c04", "c05", "c06", "c07", "c11", "c12", "c13", "c17"];
@@ -22,29 +25,6 @@ fn every_listed_case_has_a_test() {
     let source = include_str!("convert_cases.rs");
     for id in CASES {
         assert!(source.contains(&format!("\nfn {id}_")), "{id}");
-    }
-}
-
-/// A whole StreetForward network with heads of 64 channels, as detection takes them to be.
-fn small() -> ModelConfig {
-    let trunk = Trunk { dim: 64, depth: 1, heads: 1, registers: 2, mlp_ratio: 2, eps: 1e-6 };
-    ModelConfig {
-        patch: 4,
-        encoder: trunk.clone(),
-        pos_grid: 3,
-        aa: Trunk { depth: 8, heads: 2, registers: 5, ..trunk },
-        camera_dim: 64,
-        camera_depth: 1,
-        camera_heads: 1,
-        camera_width: 32,
-        depth: Head::xdec_linear(3, 64, 1, 1),
-        conf: Head::none(),
-        gs: Head::dpt(11, [0, 1, 2, 3], [4, 8, 12, 16], 8),
-        time_dim: 16,
-        causal_depth: 4,
-        causal_heads: 2,
-        motion: Head::dpt(4, [0, 1, 2, 3], [4, 8, 12, 16], 8),
-        ..ModelConfig::full()
     }
 }
 

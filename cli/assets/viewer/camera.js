@@ -61,7 +61,7 @@ function cameraAt(frames, time) {
 function lensFor(frame, width, height) {
   const s = Math.max(width / frame.width, height / frame.height);
   return {
-    width, height, fx: frame.fx * s, fy: frame.fy * s,
+    width, height, zoom: s, fx: frame.fx * s, fy: frame.fy * s,
     cx: width / 2 + (frame.cx - frame.width / 2) * s, cy: height / 2 + (frame.cy - frame.height / 2) * s,
   };
 }

@@ -220,7 +220,7 @@ class Drawer {
     gl.uniform2f(at.size, width, height);
     // The low-pass belongs to the pixels that the scene was made from: a larger picture enlarges it too,
     // else gaps open between splats.
-    const zoom = Math.max(1, fx / info.frames[0].fx);
+    const zoom = Math.max(1, camera.lens.zoom);
     gl.uniform1f(at.lowPass, info.splat.eps2d * zoom * zoom);
     gl.uniform1f(at.grow, view.grow);
     gl.uniform1f(at.most, info.splat.a_max);

@@ -1,7 +1,7 @@
 //! AVX2 without a byte dot product: sixteen outputs are two 256-bit registers.
 //!
-//! |a| times w with the sign of a, as unsigned times signed bytes added in pairs to 16 bits: at most 2 * 127 * 127 =
-//! 32,258, so the saturation of that instruction cannot happen while neither side holds -128; then pairs to 32 bits.
+//! |a| times w with the sign of a, as unsigned times signed bytes added in pairs to 16 bits: at most 2 * 128 * 127 =
+//! 32,512, so the saturation of that instruction cannot happen while weights hold no -128 (rectified maps do); then pairs to 32 bits.
 //! Tile 4 x 16: 8 sums, 2 weights, the activation and its magnitude, the ones and two temporaries of 16 registers.
 #![allow(unsafe_code)]
 

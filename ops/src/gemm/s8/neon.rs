@@ -1,6 +1,6 @@
 //! NEON without a byte dot product: sixteen outputs are four 128-bit registers.
 //!
-//! Bytes multiply to 16 bits; neighbouring products (at most 2 * 127 * 127 = 32,258) are added in 16 bits, and pairs of
+//! Bytes multiply to 16 bits; neighbouring products (at most 2 * 128 * 127 = 32,512: rectified maps hold -128, weights do not) are added in 16 bits, and pairs of
 //! those into the 32-bit sums. Tile 4 x 16: 16 sums, 4 weights, a broadcast and 8 temporaries of 32 registers.
 #![allow(unsafe_code)]
 
