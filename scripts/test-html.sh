@@ -52,6 +52,7 @@ fail() {
 open_page '#check' 504,336 --virtual-time-budget=60000 --dump-dom >"$out/check.html"
 grep -q '<html[^>]*data-state="ready"' "$out/check.html" || fail "the page did not start"
 result=$(report "$out/check.html")
+[ -n "$result" ] || fail "the page did not finish its check in time: is the machine busy?"
 echo "check  $result"
 python3 - "$result" <<'PYTHON'
 import json, sys
