@@ -2,8 +2,8 @@
 //! count of finished layers and the stage clock.
 
 use sf_formats::{Error, Result};
-use sf_ops::opclock::{self, Op, Work};
-use sf_ops::par::Pool;
+use sf_ops::Ctx;
+use sf_ops::elementwise::all_finite;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
@@ -43,7 +43,7 @@ pub(crate) struct Watch<'a> {
 pub(crate) struct Probe<'a, 't> {
     taps: Option<TapFn<'t>>,
     watch: Watch<'a>,
-    pool: &'a Pool,
+    ctx: Ctx<'a>,
     clock: Instant,
     /// Time spent per stage of [`STAGES`].
     times: &'a mut [Duration; STAGES.len()],
@@ -54,10 +54,10 @@ impl<'a, 't> Probe<'a, 't> {
     pub(crate) fn new(
         taps: Option<TapFn<'t>>,
         watch: Watch<'a>,
-        pool: &'a Pool,
+        ctx: Ctx<'a>,
         times: &'a mut [Duration; STAGES.len()],
     ) -> Probe<'a, 't> {
-        Probe { taps, watch, pool, clock: Instant::now(), times }
+        Probe { taps, watch, ctx, clock: Instant::now(), times }
     }
 
     /// Whether anybody looks: stages that need extra work to show themselves ask first.
@@ -89,8 +89,7 @@ impl<'a, 't> Probe<'a, 't> {
     /// Between layers: stops when cancelled or late, and when `data` holds a NaN or an infinity.
     pub(crate) fn guard(&self, stage: fmt::Arguments, data: &[f32]) -> Result<()> {
         self.check(stage)?;
-        let _span = opclock::span(Op::Glue, || Work { macs: 0, bytes: 4 * data.len() as u64 });
-        if !all_finite_on(self.pool, data) {
+        if !all_finite(self.ctx, data) {
             let bad = data.iter().filter(|v| !v.is_finite()).count();
             return Err(Error::integrity(
                 format!("stage {stage}"),
@@ -115,62 +114,19 @@ impl<'a, 't> Probe<'a, 't> {
     }
 }
 
-/// [`all_finite`] by the threads of a pool.
-fn all_finite_on(pool: &Pool, data: &[f32]) -> bool {
-    // 128 KiB, some ten microseconds of one thread: less is not worth a region.
-    const TASK: usize = 1 << 15;
-    let bad = AtomicBool::new(false);
-    pool.run(data.len().div_ceil(TASK), &|task, _| {
-        let piece = &data[task * TASK..data.len().min((task + 1) * TASK)];
-        if !all_finite(piece) {
-            bad.store(true, Ordering::Relaxed);
-        }
-    });
-    !bad.into_inner()
-}
-
-/// Whether no value is NaN or infinite: the exponent bits are never all ones.
-pub(crate) fn all_finite(data: &[f32]) -> bool {
-    const EXPONENT: u32 = 0x7f80_0000;
-    // Whole chunks without an exit keep the loop vectorised.
-    data.chunks(4096)
-        .all(|chunk| chunk.iter().fold(0, |bad, v| bad | u32::from(v.to_bits() & EXPONENT == EXPONENT)) == 0)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_nan_and_infinity_are_refused() {
-        let mut data = vec![f32::MAX; 10_000];
-        data[3] = f32::MIN_POSITIVE / 4.0;
-        assert!(all_finite(&data));
-        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-            for at in [0, 4095, 4096, 9999] {
-                let mut data = data.clone();
-                data[at] = bad;
-                assert!(!all_finite(&data));
-            }
-            // On threads: in every task, the last and shorter one included.
-            let pool = Pool::new(2).unwrap();
-            let mut data = vec![1.0; 70_000];
-            assert!(all_finite_on(&pool, &data));
-            for at in [0, 32_767, 32_768, 69_999] {
-                data[at] = bad;
-                assert!(!all_finite_on(&pool, &data));
-                data[at] = 1.0;
-            }
-        }
-        assert!(all_finite_on(&Pool::new(1).unwrap(), &[]));
-    }
+    use sf_ops::Kernels;
+    use sf_ops::par::Pool;
 
     #[test]
     fn cancelled_and_late_runs_stop() {
         let (cancel, layers, mut times) = (AtomicBool::new(false), AtomicU32::new(0), Default::default());
         let watch = Watch { cancel: &cancel, layers: &layers, deadline: None };
         let pool = Pool::new(1).unwrap();
-        let probe = Probe::new(None, watch, &pool, &mut times);
+        let ctx = Ctx { pool: &pool, kernels: Kernels::best() };
+        let probe = Probe::new(None, watch, ctx, &mut times);
         probe.guard(format_args!("aa.1"), &[1.0]).unwrap();
         let e = probe.guard(format_args!("aa.1"), &[f32::NAN, 0.0]).unwrap_err();
         assert_eq!(e.status() as i32, 9);
@@ -179,7 +135,7 @@ mod tests {
         assert_eq!(probe.guard(format_args!("aa.1"), &[]).unwrap_err().status() as i32, 8);
         cancel.store(false, Ordering::Relaxed);
         let deadline = Some(Instant::now() - Duration::from_secs(1));
-        let late = Probe::new(None, Watch { deadline, ..watch }, &pool, &mut times);
+        let late = Probe::new(None, Watch { deadline, ..watch }, ctx, &mut times);
         assert_eq!(late.guard(format_args!("aa.1"), &[]).unwrap_err().status() as i32, 8);
     }
 }

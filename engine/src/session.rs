@@ -247,7 +247,7 @@ impl Session {
             Net { ctx: Ctx { pool: &self.pool, kernels: self.kernels }, model: &self.model, rows: &self.rows, seen };
         let forward = Forward { net, config: self.model.config(), plan: &self.plan, tables: &self.tables, input, due };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline };
-        let mut probe = Probe::new(taps, watch, &self.pool, &mut self.times);
+        let mut probe = Probe::new(taps, watch, net.ctx, &mut self.times);
         self.complete = false;
         forward.run(Areas { pairs, guide, motion, work }, encoded, &mut self.memory, &mut probe)?;
         self.complete = true;
@@ -333,7 +333,7 @@ impl Session {
             seen: None,
         };
         let watch = Watch { cancel: &self.cancel, layers: &self.layers, deadline: None };
-        let mut probe = Probe::new(None, watch, &self.pool, &mut self.times);
+        let mut probe = Probe::new(None, watch, net.ctx, &mut self.times);
         forward::encode_frame(net, &self.plan, &self.tables, image, (work, &mut window.newest), &mut probe)
     }
 

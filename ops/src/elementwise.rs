@@ -1,10 +1,10 @@
-//! Element-wise operations on whole buffers, and the pixel shuffle.
+//! Element-wise operations on whole buffers.
 
 use crate::activation::Map;
 use crate::cpu::Ctx;
-use crate::mat::{Hwc, HwcMut, Mat};
 use crate::opclock::{self, Op, Work};
-use crate::simd::{LANES, Simd, Vector, padded};
+use crate::simd::{Body, LANES, Simd, Vector, padded};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Values of one task: 64 KiB, so that a region pays for its microsecond.
 const TASK: usize = 1 << 14;
@@ -66,61 +66,72 @@ pub fn add_assign(ctx: Ctx, x: &mut [f32], y: &[f32]) {
     ctx.pool.chunks(x, TASK, &|i, piece, _| ctx.kernels.add(piece, &y[i * TASK..][..piece.len()]));
 }
 
-/// Column `ch * p * p + dy * p + dx` of patch (y, x) fills pixel (y p + dy, x p + dx) of channel ch:
-/// `x` `[ph * pw, c * p * p]` -> `out` `[ph * p, pw * p, c]`.
-pub fn pixel_shuffle(ctx: Ctx, x: Mat, grid: (usize, usize), p: usize, out: HwcMut) {
-    let nothing = Hwc::new(&[], out.h, out.w, 0);
-    pixel_shuffle_beside(ctx, x, grid, p, nothing, out);
-}
+/// Whether no value is NaN or infinite.
+struct Finite<'a>(&'a [f32]);
 
-/// [`pixel_shuffle`] of `x` `[ph * pw, c * p * p]` to the first c channels of every pixel, those of `beside`
-/// `[ph * p, pw * p, g]` after them: `out` `[ph * p, pw * p, c + g]`.
-pub fn pixel_shuffle_beside(ctx: Ctx, x: Mat, grid: (usize, usize), p: usize, beside: Hwc, out: HwcMut) {
-    let (ph, pw) = grid;
-    let (all, g) = (out.c, beside.c);
-    let c = all.checked_sub(g).unwrap_or_else(|| panic!("{g} channels beside others do not fit {all}"));
-    assert_eq!((beside.h, beside.w), (out.h, out.w), "size of what stands beside");
-    assert_eq!((x.rows, x.cols), (ph * pw, c * p * p), "{ph} x {pw} patches of {p} x {p} x {c}");
-    assert_eq!((out.h, out.w), (ph * p, pw * p), "shuffled size");
-    let (line, width) = (out.w * all, out.w);
-    if line == 0 {
-        return;
-    }
-    let _span = opclock::span(Op::Resize, || Work::values(out.data.len()));
-    // One task per line of patches: p output lines.
-    ctx.pool.chunks(out.data, p * line, &|py, piece, _| {
-        for px in 0..pw {
-            let row = x.row(py * pw + px);
-            match p {
-                2 => spread::<2>(row, piece, (line, px, all)),
-                7 => spread::<7>(row, piece, (line, px, all)),
-                14 => spread::<14>(row, piece, (line, px, all)),
-                _ => {
-                    for (i, &v) in row.iter().enumerate() {
-                        piece[i / p % p * line + (px * p + i % p) * all + i / (p * p)] = v;
-                    }
-                }
+impl Body for Finite<'_> {
+    type Output = bool;
+
+    /// x * 0 is NaN for NaN and infinities and stays so in a sum; four sums, because one waits four cycles for each.
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> bool {
+        let (blocks, tail) = self.0.as_chunks::<LANES>();
+        let (rounds, rest) = blocks.as_chunks::<4>();
+        let zero = s.splat(0.0);
+        let mut odd = [zero; 4];
+        for round in rounds {
+            for i in 0..4 {
+                odd[i] = s.load(&round[i]).mul_add(zero, odd[i]);
             }
         }
-        if g > 0 {
-            let beside = &beside.data[py * p * width * g..][..p * width * g];
-            for (pixel, others) in piece.chunks_exact_mut(all).zip(beside.chunks_exact(g)) {
-                pixel[c..].copy_from_slice(others);
-            }
+        for block in rest {
+            odd[0] = s.load(block).mul_add(zero, odd[0]);
+        }
+        odd[1] = s.load(&padded(tail, 0.0)).mul_add(zero, odd[1]);
+        let mut lanes = [0.0; LANES];
+        ((odd[0] + odd[1]) + (odd[2] + odd[3])).store(&mut lanes);
+        lanes.iter().all(|v| *v == 0.0)
+    }
+}
+
+/// Whether no value is NaN or infinite, by the threads of the pool.
+pub fn all_finite(ctx: Ctx, x: &[f32]) -> bool {
+    // 128 KiB, some five microseconds of one thread: less is not worth a region.
+    const TASK: usize = 1 << 15;
+    let _span = opclock::span(Op::Glue, || Work { macs: 0, bytes: 4 * x.len() as u64 });
+    let bad = AtomicBool::new(false);
+    ctx.pool.run(x.len().div_ceil(TASK), &|task, _| {
+        let piece = &x[task * TASK..x.len().min((task + 1) * TASK)];
+        if !ctx.kernels.enter(Finite(piece)) {
+            bad.store(true, Ordering::Relaxed);
         }
     });
+    !bad.into_inner()
 }
 
-/// One patch of [`pixel_shuffle_beside`] with `P` pixels a side into its P output lines of `line` values: the usual sides
-/// are known at compile time, so that the inner loops are straight runs.
-fn spread<const P: usize>(row: &[f32], lines: &mut [f32], (line, px, all): (usize, usize, usize)) {
-    for dy in 0..P {
-        let patch = &mut lines[dy * line + px * P * all..][..P * all];
-        for (ch, values) in row.chunks_exact(P * P).enumerate() {
-            let from: &[f32; P] = values[dy * P..].first_chunk().expect("a line of a patch");
-            let to = &mut patch[ch..][..(P - 1) * all + 1];
-            for dx in 0..P {
-                to[dx * all] = from[dx];
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cpu::Kernels;
+    use crate::par::Pool;
+
+    #[test]
+    fn only_nan_and_infinity_are_not_finite() {
+        let pool = Pool::new(2).unwrap();
+        for kernels in Kernels::available() {
+            let ctx = Ctx { pool: &pool, kernels };
+            // In every task, every chain, the last and shorter vector included.
+            let mut x = vec![f32::MAX; 70_007];
+            x[3] = f32::MIN_POSITIVE / 4.0;
+            x[4] = f32::MIN;
+            assert!(all_finite(ctx, &x));
+            assert!(all_finite(ctx, &[]));
+            for bad in [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                for at in [0, 16, 47, 63, 64, 32_767, 32_768, 69_990, 70_000, 70_006] {
+                    let kept = std::mem::replace(&mut x[at], bad);
+                    assert!(!all_finite(ctx, &x), "{bad} at {at}");
+                    x[at] = kept;
+                }
             }
         }
     }

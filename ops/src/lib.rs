@@ -13,7 +13,8 @@
 //! | `conv.rs` `conv_s8.rs` | convolution and transposed convolution through the panels, f32 and int8 |
 //! | `conv_map.rs` | bands, and windows read in place |
 //! | `layernorm.rs` `rope.rs` | norms and rotary embedding |
-//! | `activation.rs` `elementwise.rs` | exp, sigmoid, erf, gelu; sums, pixel shuffle |
+//! | `activation.rs` `elementwise.rs` | exp, sigmoid, erf, gelu; sums, the check for NaN and infinities |
+//! | `shuffle.rs` | the pixel shuffle |
 //! | `resize.rs` | bilinear maps, Pillow's 8-bit resize, position tables |
 //! | `trig.rs` | f64 sin, cos, exp, ln for tables |
 //! | `prefetch.rs` | the hint to fetch a cache line |
@@ -44,6 +45,7 @@ pub mod quantize;
 pub mod reference;
 pub mod resize;
 pub mod rope;
+pub mod shuffle;
 pub mod simd;
 pub mod trig;
 

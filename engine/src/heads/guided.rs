@@ -21,9 +21,9 @@ use crate::net::{ConvLayer, Net};
 use crate::probe::Probe;
 use crate::tables::Tables;
 use sf_formats::Result;
-use sf_ops::elementwise::{pixel_shuffle, pixel_shuffle_beside};
 use sf_ops::gemm::Act;
 use sf_ops::mat::{Hwc, HwcMut, Mat, MatMut};
+use sf_ops::shuffle::{pixel_shuffle, pixel_shuffle_beside};
 
 /// Decoder output, then one area for the decoder's memory and later for one frame's maps.
 fn lens(head: &Guided, d: &Dims, tokens: usize, threads: usize) -> [usize; 2] {

@@ -10,9 +10,9 @@ use crate::net::Net;
 use crate::probe::Probe;
 use crate::tables::Tables;
 use sf_formats::Result;
-use sf_ops::elementwise::pixel_shuffle;
 use sf_ops::gemm::Act;
 use sf_ops::mat::{HwcMut, Mat, MatMut};
+use sf_ops::shuffle::pixel_shuffle;
 
 /// Decoder output, then one area for the decoder's memory and later for one frame's patch pixels.
 fn lens(head: &LinearHead, d: &Dims, tokens: usize, threads: usize) -> [usize; 2] {

@@ -3,7 +3,7 @@
 use crate::common::{CANARY, Random, Same, close, everywhere, same_bits};
 use crate::tolerance::{self, NORM};
 use sf_ops::rope::{AngleRound, QkNorm, RopeTable, qk_norm_rope};
-use sf_ops::{Hwc, HwcMut, Mat, MatMut, elementwise, layernorm, reference};
+use sf_ops::{Hwc, HwcMut, Mat, MatMut, layernorm, reference, shuffle};
 
 #[test]
 fn layernorm_matches_its_definition() {
@@ -155,31 +155,43 @@ fn rope_known_angles() {
 
 #[test]
 fn pixel_shuffle_matches_its_definition() {
-    for (grid, p, c) in [((1, 1), 1, 1), ((2, 3), 14, 3), ((3, 2), 4, 11), ((4, 5), 2, 16)] {
+    for (grid, p, c) in [
+        ((1, 1), 1, 1),
+        ((2, 3), 14, 3),
+        ((3, 2), 4, 11),
+        ((4, 5), 2, 16),
+        ((3, 4), 2, 11),
+        ((2, 1), 2, 17),
+        ((2, 3), 7, 24),
+        ((1, 2), 4, 33),
+        ((1, 2), 3, 20),
+    ] {
         let cols = c * p * p;
         let x = Random::new(cols as u64).vec(grid.0 * grid.1 * cols);
         let expected = reference::pixel_shuffle(Mat::new(&x, grid.0 * grid.1, cols), grid, p);
         everywhere(|ctx, name| {
             let mut y = vec![CANARY; x.len()];
             let out = HwcMut::new(&mut y, grid.0 * p, grid.1 * p, c);
-            elementwise::pixel_shuffle(ctx, Mat::new(&x, grid.0 * grid.1, cols), grid, p, out);
+            shuffle::pixel_shuffle(ctx, Mat::new(&x, grid.0 * grid.1, cols), grid, p, out);
             same_bits(&y, &expected, name);
         });
     }
     // The same beside other channels.
-    let (grid, p, c, g) = ((2, 3), 7, 5, 3);
-    let (h, w, cols) = (grid.0 * p, grid.1 * p, c * p * p);
-    let x = Random::new(1).vec(grid.0 * grid.1 * cols);
-    let beside = Random::new(2).vec(h * w * g);
-    let own = reference::pixel_shuffle(Mat::new(&x, grid.0 * grid.1, cols), grid, p);
-    let pixels = own.chunks_exact(c).zip(beside.chunks_exact(g));
-    let expected: Vec<f32> = pixels.flat_map(|(own, beside)| [own, beside].concat()).collect();
-    everywhere(|ctx, name| {
-        let mut y = vec![CANARY; expected.len()];
-        let (x, out) = (Mat::new(&x, grid.0 * grid.1, cols), HwcMut::new(&mut y, h, w, c + g));
-        elementwise::pixel_shuffle_beside(ctx, x, grid, p, Hwc::new(&beside, h, w, g), out);
-        same_bits(&y, &expected, name);
-    });
+    for (p, c, g) in [(7, 5, 3), (7, 24, 16), (2, 11, 5), (2, 3, 1)] {
+        let grid = (2, 3);
+        let (h, w, cols) = (grid.0 * p, grid.1 * p, c * p * p);
+        let x = Random::new(1).vec(grid.0 * grid.1 * cols);
+        let beside = Random::new(2).vec(h * w * g);
+        let own = reference::pixel_shuffle(Mat::new(&x, grid.0 * grid.1, cols), grid, p);
+        let pixels = own.chunks_exact(c).zip(beside.chunks_exact(g));
+        let expected: Vec<f32> = pixels.flat_map(|(own, beside)| [own, beside].concat()).collect();
+        everywhere(|ctx, name| {
+            let mut y = vec![CANARY; expected.len()];
+            let (x, out) = (Mat::new(&x, grid.0 * grid.1, cols), HwcMut::new(&mut y, h, w, c + g));
+            shuffle::pixel_shuffle_beside(ctx, x, grid, p, Hwc::new(&beside, h, w, g), out);
+            same_bits(&y, &expected, name);
+        });
+    }
     // Column c*p*p + dy*p + dx holds its own coordinates: pixel (y, x) of channel c must read (y % p, x % p).
     let p = 14;
     let row: Vec<f32> = (0..2 * p * p).map(|i| i as f32).collect();
