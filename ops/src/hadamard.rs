@@ -59,43 +59,81 @@ pub fn block(width: usize) -> usize {
     1 << width.trailing_zeros().min(MAX_BLOCK.trailing_zeros())
 }
 
-/// Lanes that a stage inside a vector subtracts: those with bit `h` of their number set.
-const fn upper(h: usize) -> u16 {
-    let (mut lanes, mut i) = (0, 0);
-    while i < LANES {
-        if i & h != 0 {
-            lanes |= 1 << i;
-        }
-        i += 1;
-    }
-    lanes
+/// Whole vectors of a row on their way into a rotation.
+pub(crate) trait Vectors<S: Simd> {
+    /// Vector i.
+    fn at(&self, s: S, i: usize) -> S::V;
 }
 
-/// Stage of distance H inside a vector: (a, b) -> (a + b, a - b).
+/// A row as it is.
+pub(crate) struct Plain<'a>(pub &'a [[f32; LANES]]);
+
+impl<S: Simd> Vectors<S> for Plain<'_> {
+    #[inline(always)]
+    fn at(&self, s: S, i: usize) -> S::V {
+        s.load(&self.0[i])
+    }
+}
+
+/// All stages of a block of `N` vectors.
 #[inline(always)]
-fn stage<V: Vector, const H: usize>(x: V) -> V {
-    x.swap::<H>() + x.negate(const { upper(H) })
+fn stages<V: Vector, const N: usize>(v: &mut [V; N]) {
+    for v in v.iter_mut() {
+        *v = v.butterfly::<1>().butterfly::<2>().butterfly::<4>().butterfly::<8>();
+    }
+    let mut h = 1;
+    while h < N {
+        for i in 0..N {
+            if i & h == 0 {
+                (v[i], v[i + h]) = (v[i] + v[i + h], v[i] - v[i + h]);
+            }
+        }
+        h *= 2;
+    }
+}
+
+/// Blocks of `N` vectors, unnormalised.
+#[inline(always)]
+fn blocks<S: Simd, X: Vectors<S>, const N: usize>(s: S, x: &X, out: &mut [f32], signs: &[u16]) -> S::V {
+    let mut largest = s.splat(0.0);
+    let out = out.as_chunks_mut::<LANES>().0.as_chunks_mut::<N>().0;
+    for (b, (block, signs)) in out.iter_mut().zip(signs.as_chunks::<N>().0).enumerate() {
+        let mut v = [largest; N];
+        for i in 0..N {
+            v[i] = x.at(s, b * N + i).negate(signs[i]);
+        }
+        stages(&mut v);
+        for i in 0..N {
+            largest = v[i].max_magnitude(largest);
+            v[i].store(&mut block[i]);
+        }
+    }
+    largest
+}
+
+/// Rotates a row without the factor 1/sqrt(block) into `out`, of the rotation's width; returns the largest magnitudes, lane by lane and by
+/// their bits, so that NaN and infinities show.
+#[inline(always)]
+pub(crate) fn rotate_into<S: Simd, X: Vectors<S>>(s: S, x: X, rotation: Rotation, out: &mut [f32]) -> S::V {
+    let signs = rotation.signs();
+    match rotation.block() {
+        16 => blocks::<S, X, 1>(s, &x, out, signs),
+        32 => blocks::<S, X, 2>(s, &x, out, signs),
+        64 => blocks::<S, X, 4>(s, &x, out, signs),
+        128 => blocks::<S, X, 8>(s, &x, out, signs),
+        other => panic!("a Hadamard block of {other}"),
+    }
 }
 
 /// Blocks of `N` vectors, unnormalised, in place.
 #[inline(always)]
-fn blocks<S: Simd, const N: usize>(s: S, x: &mut [f32], signs: &[u16]) {
-    let (vectors, _) = x.as_chunks_mut::<LANES>();
-    for (block, signs) in vectors.as_chunks_mut::<N>().0.iter_mut().zip(signs.as_chunks::<N>().0) {
+fn blocks_in_place<S: Simd, const N: usize>(s: S, x: &mut [f32], signs: &[u16]) {
+    for (block, signs) in x.as_chunks_mut::<LANES>().0.as_chunks_mut::<N>().0.iter_mut().zip(signs.as_chunks::<N>().0) {
         let mut v = [s.splat(0.0); N];
         for i in 0..N {
-            let y = s.load(&block[i]).negate(signs[i]);
-            v[i] = stage::<_, 8>(stage::<_, 4>(stage::<_, 2>(stage::<_, 1>(y))));
+            v[i] = s.load(&block[i]).negate(signs[i]);
         }
-        let mut h = 1;
-        while h < N {
-            for i in 0..N {
-                if i & h == 0 {
-                    (v[i], v[i + h]) = (v[i] + v[i + h], v[i] - v[i + h]);
-                }
-            }
-            h *= 2;
-        }
+        stages(&mut v);
         for i in 0..N {
             v[i].store(&mut block[i]);
         }
@@ -106,10 +144,10 @@ fn blocks<S: Simd, const N: usize>(s: S, x: &mut [f32], signs: &[u16]) {
 #[inline(always)]
 pub(crate) fn rotate<S: Simd>(s: S, x: &mut [f32], signs: &[u16], block: usize) {
     match block {
-        16 => blocks::<S, 1>(s, x, signs),
-        32 => blocks::<S, 2>(s, x, signs),
-        64 => blocks::<S, 4>(s, x, signs),
-        128 => blocks::<S, 8>(s, x, signs),
+        16 => blocks_in_place::<S, 1>(s, x, signs),
+        32 => blocks_in_place::<S, 2>(s, x, signs),
+        64 => blocks_in_place::<S, 4>(s, x, signs),
+        128 => blocks_in_place::<S, 8>(s, x, signs),
         other => panic!("a Hadamard block of {other}"),
     }
 }

@@ -10,7 +10,7 @@
 use crate::activation::relu_lanes;
 use crate::cpu::Ctx;
 use crate::gemm::s8::pack::{QUAD, RowsS8Mut, padded_k};
-use crate::hadamard::{Rotation, rotate};
+use crate::hadamard::{Plain, Rotation, Vectors, rotate_into};
 use crate::layernorm::{NormRow, moments, norm_row};
 use crate::mat::Mat;
 use crate::opclock::{self, Op, Work};
@@ -58,6 +58,25 @@ pub(crate) struct QuantizeRow<'a> {
     pub out: &'a mut [i8],
 }
 
+/// (x - mean) / sqrt(var + eps), times gain, plus offset where there are any; whole vectors.
+struct Normed<'a, V> {
+    x: &'a [[f32; LANES]],
+    mean: V,
+    scale: V,
+    affine: Option<(&'a [[f32; LANES]], &'a [[f32; LANES]])>,
+}
+
+impl<S: Simd> Vectors<S> for Normed<'_, S::V> {
+    #[inline(always)]
+    fn at(&self, s: S, i: usize) -> S::V {
+        let v = (s.load(&self.x[i]) - self.mean) * self.scale;
+        match self.affine {
+            Some((gain, offset)) => v.mul_add(s.load(&gain[i]), s.load(&offset[i])),
+            None => v,
+        }
+    }
+}
+
 /// (x - mean) / sqrt(var + eps).
 #[inline(always)]
 fn standardize<S: Simd>(s: S, x: &[f32], eps: f32, out: &mut [f32]) {
@@ -75,7 +94,7 @@ fn standardize<S: Simd>(s: S, x: &[f32], eps: f32, out: &mut [f32]) {
     }
 }
 
-/// Vectors looked at together: their maxima and checks are chains of four cycles a vector, where two could be read in one.
+/// Vectors looked at together: their maxima are chains of a few cycles a vector, where two could be read in one.
 const TOGETHER: usize = 4;
 
 /// (max |x|, whether every value is finite); of the rectified values with `relu`.
@@ -83,7 +102,7 @@ const TOGETHER: usize = 4;
 fn largest<S: Simd>(s: S, x: &[f32], relu: bool) -> (f32, bool) {
     let (blocks, tail) = x.as_chunks::<LANES>();
     let (rounds, rest) = blocks.as_chunks::<TOGETHER>();
-    let mut seen = [(s.splat(0.0), s.splat(0.0)); TOGETHER];
+    let mut seen = [s.splat(0.0); TOGETHER];
     for round in rounds {
         for i in 0..TOGETHER {
             seen[i] = look(s, s.load(&round[i]), relu, seen[i]);
@@ -95,30 +114,31 @@ fn largest<S: Simd>(s: S, x: &[f32], relu: bool) -> (f32, bool) {
     if !tail.is_empty() {
         seen[0] = look(s, s.load(&padded(tail, 0.0)), relu, seen[0]);
     }
-    let (mut max, mut odd) = seen[0];
-    for i in 1..TOGETHER {
-        (max, odd) = (seen[i].0.max(max), odd + seen[i].1);
-    }
-    let (mut m, mut o) = ([0.0f32; LANES], [0.0f32; LANES]);
-    max.store(&mut m);
-    odd.store(&mut o);
-    let m = m.into_iter().fold(0.0, |a, b| if b > a { b } else { a });
-    (m, o.iter().all(|v| *v == 0.0))
+    let max = seen[0].max_magnitude(seen[1]).max_magnitude(seen[2].max_magnitude(seen[3]));
+    largest_number(max)
 }
 
-/// The larger magnitude, and 0 while every value is finite: x * 0 is NaN for NaN and infinities and stays so; the maximum drops NaN.
+/// The largest of magnitudes by their bits, in every lane.
 #[inline(always)]
-fn look<S: Simd>(s: S, v: S::V, relu: bool, (max, odd): (S::V, S::V)) -> (S::V, S::V) {
-    let v = if relu { relu_lanes(s, v) } else { v };
-    (v.abs().max(max), v.mul_add(s.splat(0.0), odd))
+pub(crate) fn largest_lane<V: Vector>(v: V) -> V {
+    let v = v.max_magnitude(v.swap::<8>());
+    let v = v.max_magnitude(v.swap::<4>());
+    let v = v.max_magnitude(v.swap::<2>());
+    v.max_magnitude(v.swap::<1>())
 }
 
-/// To [-127, 127] by compare and select.
+/// The largest of magnitudes by their bits, and whether it is finite.
 #[inline(always)]
-pub(crate) fn clamp<S: Simd>(s: S, v: S::V) -> S::V {
-    let top = s.splat(127.0);
-    let v = s.splat(-127.0).max(v);
-    v.select_gt(top, top, v)
+fn largest_number<V: Vector>(v: V) -> (f32, bool) {
+    let mut lanes = [0.0f32; LANES];
+    largest_lane(v).store(&mut lanes);
+    (lanes[0], lanes[0].is_finite())
+}
+
+/// The larger magnitude. Rectified, minus infinity is 0 as it is for the ReLU that was meant; NaN stays.
+#[inline(always)]
+fn look<S: Simd>(s: S, v: S::V, relu: bool, max: S::V) -> S::V {
+    if relu { relu_lanes(s, v).max_magnitude(max) } else { v.max_magnitude(max) }
 }
 
 /// Quantizes one row; returns its scale.
@@ -128,32 +148,46 @@ pub(crate) fn quantize_row<S: Simd>(s: S, row: QuantizeRow) -> f32 {
     let work = &mut work[..x.len()];
     let mut factor = 1.0;
     let changed = before.norm.is_some() || before.rotation.is_some();
-    match before.norm {
-        Some(Norm { affine: Some((gain, offset)), eps }) => norm_row(s, NormRow { x, gain, offset, eps, out: work }),
-        Some(Norm { affine: None, eps }) => standardize(s, x, eps, work),
-        None if before.rotation.is_some() => work.copy_from_slice(x),
-        None => {}
-    }
-    if let Some(rotation) = before.rotation {
-        rotate(s, work, rotation.signs(), rotation.block());
-        factor = rotation.normalizer();
-    }
+    let (max, finite) = match before {
+        // One pass from the row to its rotated self: blocks of up to 128 values stay in registers.
+        Before { norm, rotation: Some(rotation) } => {
+            factor = rotation.normalizer();
+            let x_blocks = x.as_chunks::<LANES>().0;
+            largest_number(match norm {
+                None => rotate_into(s, Plain(x_blocks), rotation, work),
+                Some(Norm { affine, eps }) => {
+                    let (mean, scale) = moments(s, x, eps);
+                    let (mean, scale) = (s.splat(mean), s.splat(scale));
+                    let affine = affine.map(|(g, o)| (g.as_chunks::<LANES>().0, o.as_chunks::<LANES>().0));
+                    rotate_into(s, Normed { x: x_blocks, mean, scale, affine }, rotation, work)
+                }
+            })
+        }
+        Before { norm: Some(Norm { affine, eps }), rotation: None } => {
+            match affine {
+                Some((gain, offset)) => norm_row(s, NormRow { x, gain, offset, eps, out: work }),
+                None => standardize(s, x, eps, work),
+            }
+            largest(s, work, false)
+        }
+        Before { norm: None, rotation: None } => largest(s, x, false),
+    };
     let x = if changed { &*work } else { x };
-    let (max, finite) = largest(s, x, false);
     let inverse = 127.0 / max;
     if !finite || !inverse.is_finite() {
         out.fill(0);
         return if finite { 0.0 } else { f32::NAN };
     }
+    // No clamp: |x| k is at most 127 (1 + 2^-23).
     let k = s.splat(inverse);
     let (xb, xt) = x.as_chunks::<LANES>();
     let (yb, yt) = out.as_chunks_mut::<LANES>();
     for (x, y) in xb.iter().zip(yb.iter_mut()) {
-        clamp(s, s.load(x) * k).store_s8(y);
+        (s.load(x) * k).store_s8(y);
     }
     // What is left of the padded row: less than 16 values, or a whole 16 of which x has 13 to 15.
     let mut bytes = [0i8; LANES];
-    clamp(s, s.load(&padded(xt, 0.0)) * k).store_s8(&mut bytes);
+    (s.load(&padded(xt, 0.0)) * k).store_s8(&mut bytes);
     match yb.get_mut(xb.len()) {
         Some(y) => *y = bytes,
         None => yt.copy_from_slice(&bytes[..yt.len()]),
@@ -308,11 +342,9 @@ fn quantized<S: Simd>(s: S, v: S::V, relu: bool, inverse: f32) -> [i8; LANES] {
         return bytes;
     }
     if relu {
-        let v = relu_lanes(s, v).mul_add(s.splat(inverse), s.splat(f32::from(RECTIFIED_ZERO)));
-        let top = s.splat(127.0);
-        v.select_gt(top, top, v).store_s8(&mut bytes);
+        relu_lanes(s, v).mul_add(s.splat(inverse), s.splat(f32::from(RECTIFIED_ZERO))).store_s8(&mut bytes);
     } else {
-        clamp(s, v * s.splat(inverse)).store_s8(&mut bytes);
+        (v * s.splat(inverse)).store_s8(&mut bytes);
     }
     bytes
 }

@@ -7,7 +7,7 @@ use crate::gemm::s8::pack::QUAD;
 use crate::gemm::s8::table::{Activations, GemmS8Kernel};
 use crate::hadamard::{Rotation, rotate};
 use crate::prefetch::near_l1;
-use crate::quantize::clamp;
+use crate::quantize::largest_lane;
 use crate::rope::{RopeTable, turn};
 use crate::simd::{LANES, Simd, Vector, fold_lanes};
 
@@ -95,15 +95,6 @@ pub(crate) struct HeadRows<'a> {
     pub rope: Option<Turn<'a>>,
     /// Rotation without its factor.
     pub rotation: Option<Rotation<'a>>,
-}
-
-/// Largest lane in every lane.
-#[inline(always)]
-fn largest_lane<V: Vector>(v: V) -> V {
-    let v = v.max(v.swap::<8>());
-    let v = v.max(v.swap::<4>());
-    let v = v.max(v.swap::<2>());
-    v.max(v.swap::<1>())
 }
 
 /// Norm, turn and rotation of rows -> `out` `[rows, 16 n]` and 16 values more; zeros behind d.
@@ -236,28 +227,26 @@ fn quantize_centred<S: Simd>(s: S, x: &[[f32; LANES]], mean: Option<&[[f32; LANE
     let n = x.len();
     let zero = s.splat(0.0);
     let mut v = [zero; MAX_N];
-    let (mut max, mut odd) = (zero, zero);
+    let mut max = zero;
     for i in 0..n {
         v[i] = s.load(&x[i]);
         if let Some(mean) = mean {
             v[i] = v[i] - s.load(&mean[i]);
         }
-        max = v[i].abs().max(max);
-        // NaN for NaN and infinities, and stays so.
-        odd = v[i].mul_add(zero, odd);
+        max = v[i].max_magnitude(max);
     }
     let max = largest_lane(max);
     let out = &mut out[..n];
     let top = s.splat(127.0);
     let inverse = top / max;
-    // Both sides of 127 / max must be finite, and every value.
-    let (finite, small) = (s.splat(1.0).gt_bits(odd) == u16::MAX, inverse.gt_bits(s.splat(f32::MAX)) != 0);
+    // Both sides of 127 / max must be finite; magnitudes by their bits are infinite or NaN where a value is.
+    let (finite, small) = (s.splat(f32::INFINITY).gt_bits(max) == u16::MAX, inverse.gt_bits(s.splat(f32::MAX)) != 0);
     if !finite || small {
         out.fill([0; LANES]);
         return if finite { 0.0 } else { f32::NAN };
     }
     for i in 0..n {
-        clamp(s, v[i] * inverse).store_s8(&mut out[i]);
+        (v[i] * inverse).store_s8(&mut out[i]);
     }
     let mut scale = [0.0; LANES];
     (max / top).store(&mut scale);

@@ -326,6 +326,17 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn max_magnitude(self, o: V) -> V {
+        let a = self.abs();
+        // SAFETY: the vectors prove avx2.
+        unsafe {
+            let lo = _mm256_max_epu32(_mm256_castps_si256(a.0), _mm256_castps_si256(o.0));
+            let hi = _mm256_max_epu32(_mm256_castps_si256(a.1), _mm256_castps_si256(o.1));
+            V(_mm256_castsi256_ps(lo), _mm256_castsi256_ps(hi))
+        }
+    }
+
+    #[inline(always)]
     fn store_s8(self, x: &mut [i8; LANES]) {
         // SAFETY: the vector proves avx2; 16 bytes are writable.
         unsafe {

@@ -167,6 +167,22 @@ unsafe fn index(table: &[i32; LANES]) -> __m512i {
     unsafe { _mm512_loadu_si512(table.as_ptr().cast()) }
 }
 
+/// 1 in the lanes where bit `h` of the number is clear, else -1.
+const fn ones_less(h: usize) -> &'static [f32; LANES] {
+    const SIGNS: [[f32; LANES]; 4] = {
+        let mut signs = [[1.0; LANES]; 4];
+        let mut at = 0;
+        while at < 4 * LANES {
+            if (at % LANES) >> (at / LANES) & 1 == 1 {
+                signs[at / LANES][at % LANES] = -1.0;
+            }
+            at += 1;
+        }
+        signs
+    };
+    &SIGNS[h.trailing_zeros() as usize]
+}
+
 /// Numbers 3 i + c of 48: those below 32 from two vectors, then the rest from that (lanes 0..16) and the third.
 const PICK3: [[[i32; LANES]; 2]; 3] = {
     let mut table = [[[0; LANES]; 2]; 3];
@@ -376,6 +392,25 @@ impl Vector for V {
                 4 => _mm512_shuffle_f32x4::<0xb1>(x, x),
                 _ => _mm512_shuffle_f32x4::<0x4e>(x, x),
             })
+        }
+    }
+
+    #[inline(always)]
+    fn butterfly<const H: usize>(self) -> V {
+        // One multiply-add by 1 or -1, exact, instead of a sum and a change of signs.
+        // SAFETY: the vector proves avx512f; 16 values are readable.
+        unsafe {
+            let signs = _mm512_loadu_ps(const { ones_less(H) }.as_ptr());
+            V(_mm512_fmadd_ps(self.0, signs, self.swap::<H>().0))
+        }
+    }
+
+    #[inline(always)]
+    fn max_magnitude(self, o: V) -> V {
+        // SAFETY: the vectors prove avx512f.
+        unsafe {
+            let larger = _mm512_max_epu32(_mm512_castps_si512(self.abs().0), _mm512_castps_si512(o.0));
+            V(_mm512_castsi512_ps(larger))
         }
     }
 

@@ -165,10 +165,29 @@ pub trait Vector: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = 
     fn negate(self, lanes: u16) -> Self;
     /// Lane i takes lane i ^ H, for H = 1, 2, 4, 8.
     fn swap<const H: usize>(self) -> Self;
-    /// Lanes in [-127, 127] to bytes, rounded to nearest, ties to even.
+    /// Lane i and lane i ^ H: the sum where bit H of i is clear, lane i ^ H less lane i where it is set; one stage of a Hadamard transform.
+    #[inline(always)]
+    fn butterfly<const H: usize>(self) -> Self {
+        self.swap::<H>() + self.negate(const { lanes_with(H) })
+    }
+    /// The larger of |self| and `other`, which is not negative, by their bits: infinity is above every number, and NaN above infinity.
+    fn max_magnitude(self, other: Self) -> Self;
+    /// Lanes within 1/2 of [-127, 127] to bytes, rounded to nearest, ties to even.
     fn store_s8(self, x: &mut [i8; LANES]);
     /// Byte 4i + j takes the lowest byte of the bits of lane i of vector j.
     fn store_low_bytes(v: [Self; 4], x: &mut [i8; 4 * LANES]);
+}
+
+/// Lanes with bit `h` of their number set.
+const fn lanes_with(h: usize) -> u16 {
+    let (mut lanes, mut i) = (0, 0);
+    while i < LANES {
+        if i & h != 0 {
+            lanes |= 1 << i;
+        }
+        i += 1;
+    }
+    lanes
 }
 
 /// Sum of the lanes in the one fixed order, l + (l+8), then +4, +2, +1, in every lane: addition commutes, so that the lanes'
@@ -253,6 +272,8 @@ mod tests {
             s.splat(1.25).times_pow2(minus_n).store(&mut to[15]);
             s.store_chosen(a, chosen, &mut to[16]);
             to[16][chosen.count_ones() as usize..].fill(0.0);
+            a.butterfly::<1>().butterfly::<2>().butterfly::<4>().butterfly::<8>().store(&mut to[17]);
+            a.max_magnitude(b.abs()).store(&mut to[18]);
             let mut packed = [[0.0; 3]; LANES];
             s.store3([a, b, c], &mut packed);
             let mut to = to.concat();

@@ -311,6 +311,18 @@ impl Vector for V {
     }
 
     #[inline(always)]
+    fn max_magnitude(self, o: V) -> V {
+        let mut y = self.abs().0;
+        // SAFETY: the vectors prove neon.
+        unsafe {
+            for (a, b) in y.iter_mut().zip(o.0) {
+                *a = vreinterpretq_f32_u32(vmaxq_u32(vreinterpretq_u32_f32(*a), vreinterpretq_u32_f32(b)));
+            }
+        }
+        V(y)
+    }
+
+    #[inline(always)]
     fn store_s8(self, x: &mut [i8; LANES]) {
         let [a, b, c, d] = self.0;
         // SAFETY: the vector proves neon; 16 bytes are writable.

@@ -152,6 +152,11 @@ impl Vector for Lanes {
     }
 
     #[inline(always)]
+    fn max_magnitude(self, o: Lanes) -> Lanes {
+        self.zip(o, |a, b| f32::from_bits(a.abs().to_bits().max(b.to_bits())))
+    }
+
+    #[inline(always)]
     fn store_s8(self, x: &mut [i8; LANES]) {
         *x = self.0.map(round_s8);
     }
@@ -306,6 +311,11 @@ impl Vector for Lane {
     #[inline(always)]
     fn swap<const H: usize>(self) -> Lane {
         self
+    }
+
+    #[inline(always)]
+    fn max_magnitude(self, o: Lane) -> Lane {
+        Lane(f32::from_bits(self.0.abs().to_bits().max(o.0.to_bits())))
     }
 
     #[inline(always)]
