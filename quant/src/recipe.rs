@@ -3,7 +3,7 @@
 //! | matrix | at f16 | at int8 | why |
 //! |---|---|---|---|
 //! | camera head; last layer of every head | f32 | f32 | tiny, and their errors reach poses, log depth and velocities unweakened |
-//! | but that of a guided Gaussian head | f32 | int8 | a twentieth of the work; colours, opacities and sizes bear it: nothing changes in the render |
+//! | but those of guided Gaussian and motion heads | f32 | int8 | a twentieth of the work each; what they give bears it: a tenth of a decibel of the render at most |
 //! | patch embedding, time embedding | f16 | f16 | inputs of 588 and d_t values that no norm precedes; under 1 % of the work |
 //! | first convolution of a guided depth head | f16 | f16 | reads features beside the image, of very different sizes under one scale: 3 dB of the render |
 //! | input width that is no multiple of 16 | f16 | f16 | has no rotation |
@@ -64,7 +64,12 @@ pub(crate) fn choose(
         return because(Dtype::F32, "camera head");
     }
     let last = output_layer(config, &spec.name);
-    let bears_int8 = asked == Dtype::Int8 && last == Some("gs") && config.gs.kind == HeadKind::Guided;
+    let guided = match last {
+        Some("gs") => config.gs.kind == HeadKind::Guided,
+        Some("motion") => config.motion.kind == HeadKind::Guided,
+        _ => false,
+    };
+    let bears_int8 = asked == Dtype::Int8 && guided;
     if last.is_some() && !bears_int8 {
         return because(Dtype::F32, "last layer of a head");
     }
