@@ -58,12 +58,16 @@ pub(crate) struct QuantizeRow<'a> {
     pub out: &'a mut [i8],
 }
 
+/// Whole vectors of a row.
+type Whole<'a> = &'a [[f32; LANES]];
+
 /// (x - mean) / sqrt(var + eps), times gain, plus offset where there are any; whole vectors.
 struct Normed<'a, V> {
-    x: &'a [[f32; LANES]],
+    x: Whole<'a>,
     mean: V,
     scale: V,
-    affine: Option<(&'a [[f32; LANES]], &'a [[f32; LANES]])>,
+    /// Gain and offset.
+    affine: Option<(Whole<'a>, Whole<'a>)>,
 }
 
 impl<S: Simd> Vectors<S> for Normed<'_, S::V> {
