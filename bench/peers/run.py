@@ -34,8 +34,11 @@ def say(text):
     print(text, file=sys.stderr, flush=True)
 
 
+PROGRAM = ROOT / "target/release/streetforward"
+
+
 def cli(*args):
-    done = subprocess.run([str(ROOT / "target/release/streetforward"), *map(str, args)], capture_output=True, text=True)
+    done = subprocess.run([str(PROGRAM), *map(str, args)], capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"streetforward {args[0]}: {done.stderr.strip().splitlines()[-1]}")
 
@@ -67,8 +70,10 @@ class Files:
         self.blobs = {}
         for precision in ("f32", "int8"):
             blob = self.folder / f"{name}-{precision}.sfw"
-            if not blob.exists():
-                cli("convert", self.checkpoint, "--to", precision, "-o", blob)
+            # Again when the program or the weights are newer: another recipe makes another network.
+            newest = max(f.stat().st_mtime for f in (PROGRAM, self.checkpoint))
+            if not blob.exists() or blob.stat().st_mtime < newest:
+                cli("convert", self.checkpoint, "--to", precision, "-o", blob, "--force")
             self.blobs[precision] = blob
         self.stem = self.folder / f"{name}-{len(args.frames)}x{self.width}x{self.height}"
         self.name = name

@@ -61,8 +61,8 @@ pub fn block(width: usize) -> usize {
 
 /// Whole vectors of a row on their way into a rotation.
 pub(crate) trait Vectors<S: Simd> {
-    /// Vector i.
-    fn at(&self, s: S, i: usize) -> S::V;
+    /// Vector i; `out` is what the result's place holds.
+    fn at(&self, s: S, i: usize, out: &[f32; LANES]) -> S::V;
 }
 
 /// A row as it is.
@@ -70,8 +70,18 @@ pub(crate) struct Plain<'a>(pub &'a [[f32; LANES]]);
 
 impl<S: Simd> Vectors<S> for Plain<'_> {
     #[inline(always)]
-    fn at(&self, s: S, i: usize) -> S::V {
+    fn at(&self, s: S, i: usize, _out: &[f32; LANES]) -> S::V {
         s.load(&self.0[i])
+    }
+}
+
+/// The row that the result replaces.
+struct InPlace;
+
+impl<S: Simd> Vectors<S> for InPlace {
+    #[inline(always)]
+    fn at(&self, s: S, _i: usize, out: &[f32; LANES]) -> S::V {
+        s.load(out)
     }
 }
 
@@ -100,7 +110,7 @@ fn blocks<S: Simd, X: Vectors<S>, const N: usize>(s: S, x: &X, out: &mut [f32], 
     for (b, (block, signs)) in out.iter_mut().zip(signs.as_chunks::<N>().0).enumerate() {
         let mut v = [largest; N];
         for i in 0..N {
-            v[i] = x.at(s, b * N + i).negate(signs[i]);
+            v[i] = x.at(s, b * N + i, &block[i]).negate(signs[i]);
         }
         stages(&mut v);
         for i in 0..N {
@@ -114,9 +124,8 @@ fn blocks<S: Simd, X: Vectors<S>, const N: usize>(s: S, x: &X, out: &mut [f32], 
 /// Rotates a row without the factor 1/sqrt(block) into `out`, of the rotation's width; returns the largest magnitudes, lane by lane and by
 /// their bits, so that NaN and infinities show.
 #[inline(always)]
-pub(crate) fn rotate_into<S: Simd, X: Vectors<S>>(s: S, x: X, rotation: Rotation, out: &mut [f32]) -> S::V {
-    let signs = rotation.signs();
-    match rotation.block() {
+pub(crate) fn rotate_into<S: Simd, X: Vectors<S>>(s: S, x: X, out: &mut [f32], signs: &[u16], block: usize) -> S::V {
+    match block {
         16 => blocks::<S, X, 1>(s, &x, out, signs),
         32 => blocks::<S, X, 2>(s, &x, out, signs),
         64 => blocks::<S, X, 4>(s, &x, out, signs),
@@ -125,31 +134,10 @@ pub(crate) fn rotate_into<S: Simd, X: Vectors<S>>(s: S, x: X, rotation: Rotation
     }
 }
 
-/// Blocks of `N` vectors, unnormalised, in place.
-#[inline(always)]
-fn blocks_in_place<S: Simd, const N: usize>(s: S, x: &mut [f32], signs: &[u16]) {
-    for (block, signs) in x.as_chunks_mut::<LANES>().0.as_chunks_mut::<N>().0.iter_mut().zip(signs.as_chunks::<N>().0) {
-        let mut v = [s.splat(0.0); N];
-        for i in 0..N {
-            v[i] = s.load(&block[i]).negate(signs[i]);
-        }
-        stages(&mut v);
-        for i in 0..N {
-            v[i].store(&mut block[i]);
-        }
-    }
-}
-
 /// Rotates a row without the factor 1/sqrt(block).
 #[inline(always)]
 pub(crate) fn rotate<S: Simd>(s: S, x: &mut [f32], signs: &[u16], block: usize) {
-    match block {
-        16 => blocks_in_place::<S, 1>(s, x, signs),
-        32 => blocks_in_place::<S, 2>(s, x, signs),
-        64 => blocks_in_place::<S, 4>(s, x, signs),
-        128 => blocks_in_place::<S, 8>(s, x, signs),
-        other => panic!("a Hadamard block of {other}"),
-    }
+    rotate_into(s, InPlace, x, signs, block);
 }
 
 /// Values of one task: about 64 KiB.

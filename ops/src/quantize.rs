@@ -72,7 +72,7 @@ struct Normed<'a, V> {
 
 impl<S: Simd> Vectors<S> for Normed<'_, S::V> {
     #[inline(always)]
-    fn at(&self, s: S, i: usize) -> S::V {
+    fn at(&self, s: S, i: usize, _out: &[f32; LANES]) -> S::V {
         let v = (s.load(&self.x[i]) - self.mean) * self.scale;
         match self.affine {
             Some((gain, offset)) => v.mul_add(s.load(&gain[i]), s.load(&offset[i])),
@@ -139,7 +139,7 @@ fn largest_number<V: Vector>(v: V) -> (f32, bool) {
     (lanes[0], lanes[0].is_finite())
 }
 
-/// The larger magnitude. Rectified, minus infinity is 0 as it is for the ReLU that was meant; NaN stays.
+/// The larger magnitude, of the rectified value with `relu`: minus infinity is then 0, NaN stays.
 #[inline(always)]
 fn look<S: Simd>(s: S, v: S::V, relu: bool, max: S::V) -> S::V {
     if relu { relu_lanes(s, v).max_magnitude(max) } else { v.max_magnitude(max) }
@@ -156,14 +156,15 @@ pub(crate) fn quantize_row<S: Simd>(s: S, row: QuantizeRow) -> f32 {
         // One pass from the row to its rotated self: blocks of up to 128 values stay in registers.
         Before { norm, rotation: Some(rotation) } => {
             factor = rotation.normalizer();
+            let (signs, block) = (rotation.signs(), rotation.block());
             let x_blocks = x.as_chunks::<LANES>().0;
             largest_number(match norm {
-                None => rotate_into(s, Plain(x_blocks), rotation, work),
+                None => rotate_into(s, Plain(x_blocks), work, signs, block),
                 Some(Norm { affine, eps }) => {
                     let (mean, scale) = moments(s, x, eps);
                     let (mean, scale) = (s.splat(mean), s.splat(scale));
                     let affine = affine.map(|(g, o)| (g.as_chunks::<LANES>().0, o.as_chunks::<LANES>().0));
-                    rotate_into(s, Normed { x: x_blocks, mean, scale, affine }, rotation, work)
+                    rotate_into(s, Normed { x: x_blocks, mean, scale, affine }, work, signs, block)
                 }
             })
         }
@@ -338,7 +339,8 @@ fn pixels<S: Simd, T: MapValue>(s: S, (x, c, relu): (&[f32], usize, bool), scale
     }
 }
 
-/// Sixteen quantized values, round(v * inverse), or round(relu(v) * inverse - 128) rectified; an inverse of 0 gives zeros.
+/// Sixteen quantized values, round(v * inverse), or round(relu(v) * inverse - 128) rectified; an inverse of 0 gives zeros. No clamp: the
+/// inverse is that of the largest of them.
 #[inline(always)]
 fn quantized<S: Simd>(s: S, v: S::V, relu: bool, inverse: f32) -> [i8; LANES] {
     let mut bytes = [zero_of(relu); LANES];

@@ -110,13 +110,18 @@ fn quads<S: Simd>(s: S, row: &[f32], out: &mut [f32], (width, px): (usize, usize
     }
 }
 
-/// One patch: sixteen channels by sixteen pixels at a time, what is left over value by value.
+/// One patch: sixteen channels by sixteen pixels at a time, or value by value where there are fewer of either.
 #[inline(always)]
 fn patch<S: Simd>(s: S, row: &[f32], out: &mut [f32], (pw, px): (usize, usize), (p, c, all): (usize, usize, usize)) {
     let pixels = p * p;
     let at = |q: usize| ((q / p) * pw * p + px * p + q % p) * all;
-    let blocks = if pixels < LANES || c < LANES { 0 } else { c.div_ceil(LANES) };
-    for b in 0..blocks {
+    if pixels < LANES || c < LANES {
+        for (i, &v) in row.iter().enumerate() {
+            out[at(i % pixels) + i / pixels] = v;
+        }
+        return;
+    }
+    for b in 0..c.div_ceil(LANES) {
         // The last sixteen channels overlap those before, as the last sixteen pixels do.
         let c0 = (b * LANES).min(c - LANES);
         let mut q0 = 0;
@@ -131,11 +136,6 @@ fn patch<S: Simd>(s: S, row: &[f32], out: &mut [f32], (pw, px): (usize, usize), 
                 *out[at(first + i) + c0..].first_chunk_mut().expect("sixteen channels of a pixel") = *from;
             }
             q0 = first + LANES;
-        }
-    }
-    for ch in if blocks == 0 { 0..c } else { 0..0 } {
-        for (q, &v) in row[ch * pixels..][..pixels].iter().enumerate() {
-            out[at(q) + ch] = v;
         }
     }
 }
