@@ -336,35 +336,41 @@ impl Layer<'_> {
         let n = self.weight.n;
         let (acc_stride, col) = (self.kernel.mr * NR, tile.panel * NR);
         let rows = tile.scales.len();
-        let finish =
-            |panel: usize, panels: usize, out: &SharedMut<f32>, at: usize, stride: usize, cols: usize, plus| {
-                self.ctx.kernels.finish_s8(FinishS8 {
-                    acc: &tile.acc[panel * acc_stride..],
-                    acc_stride,
-                    panels,
-                    row_scales: tile.scales,
-                    columns: &tile.columns.from(panel),
-                    act: self.conv.act,
-                    gamma: false,
-                    plus,
-                    relu_sum: self.conv.relu_sum,
-                    out,
-                    at,
-                    stride,
-                    cols,
-                });
-            };
+        let finish = |panel: usize,
+                      panels: usize,
+                      columns: &ColumnsS8,
+                      out: &SharedMut<f32>,
+                      at: usize,
+                      stride: usize,
+                      cols: usize,
+                      plus| {
+            self.ctx.kernels.finish_s8(FinishS8 {
+                acc: &tile.acc[panel * acc_stride..],
+                acc_stride,
+                panels,
+                row_scales: tile.scales,
+                columns,
+                act: self.conv.act,
+                gamma: false,
+                plus,
+                relu_sum: self.conv.relu_sum,
+                out,
+                at,
+                stride,
+                cols,
+            });
+        };
         match out {
             Out::Image { out, residual } => {
                 let plus = residual.map_or(Plus::Nothing, Plus::Other);
                 let cols = (tile.panels * NR).min(n - col);
-                finish(0, tile.panels, out, tile.row * n + col, n, cols, plus);
+                finish(0, tile.panels, tile.columns, out, tile.row * n + col, n, cols, plus);
             }
             Out::Sink(sink) => {
                 for panel in 0..tile.panels {
                     let mut values = [0.0; MAX_MR * NR];
                     let values = &mut values[..rows * NR];
-                    finish(panel, 1, &SharedMut::new(values), 0, NR, NR, Plus::Nothing);
+                    finish(panel, 1, &tile.columns.panel(panel), &SharedMut::new(values), 0, NR, NR, Plus::Nothing);
                     let col = col + panel * NR;
                     sink.put(tile.row, col, NR.min(n - col), values);
                 }

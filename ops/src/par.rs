@@ -365,6 +365,22 @@ impl<'a, T> SharedMut<'a, T> {
         // SAFETY: inside the buffer (checked); exclusive by the caller's promise and the borrow in `owner`.
         unsafe { std::slice::from_raw_parts_mut(self.data.add(range.start), range.end - range.start) }
     }
+
+    /// `N` pieces of `len` values, `stride` apart, the first at `at`: checked once, so that a loop over them is free of checks.
+    ///
+    /// # Panics
+    /// When a piece leaves the buffer or they overlap.
+    ///
+    /// # Safety
+    /// As of [`SharedMut::slice`].
+    #[allow(unsafe_code, clippy::mut_from_ref)]
+    #[inline(always)]
+    pub(crate) unsafe fn lines<const N: usize>(&self, at: usize, stride: usize, len: usize) -> [&'a mut [T]; N] {
+        let end = stride.checked_mul(N - 1).and_then(|v| v.checked_add(at)).and_then(|v| v.checked_add(len));
+        assert!(stride >= len && end.is_some_and(|end| end <= self.len), "{N} pieces from {at} of {} values", self.len);
+        // SAFETY: inside the buffer (checked); exclusive by the caller's promise and the borrow in `owner`.
+        std::array::from_fn(|i| unsafe { std::slice::from_raw_parts_mut(self.data.add(at + i * stride), len) })
+    }
 }
 
 #[cfg(test)]

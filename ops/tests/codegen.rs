@@ -13,9 +13,9 @@ use std::process::Command;
 /// The one instruction that does the work of a kernel of instruction set `isa`.
 fn work(entry: &str, isa: &str) -> &'static str {
     match (entry, isa) {
-        ("gemm_s8" | "conv_s8" | "column_s8", "avx2") => "vpmaddubsw",
-        ("gemm_s8" | "conv_s8" | "column_s8", "avx2wide") => "vpmaddwd",
-        ("gemm_s8" | "conv_s8" | "column_s8", _) => "vpdpbusd",
+        ("gemm_s8" | "conv_s8" | "column_s8" | "product_s8", "avx2") => "vpmaddubsw",
+        ("gemm_s8" | "conv_s8" | "column_s8" | "product_s8", "avx2wide") => "vpmaddwd",
+        ("gemm_s8" | "conv_s8" | "column_s8" | "product_s8", _) => "vpdpbusd",
         _ => "vfmadd",
     }
 }
@@ -98,9 +98,9 @@ fn tiles_are_tight_loops() {
         ["gemm_s8", "conv_s8"].map(|entry| Tile { name: r.name, entry, rows: r.rows, mr: r.mr, nr: r.nr })
     });
     // Full tiles below one another; a rest goes to the first entry.
-    let columns = GEMM_S8.iter().map(|r| {
+    let columns = GEMM_S8.iter().flat_map(|r| {
         let full = &r.rows[r.rows.len() - 1..];
-        Tile { name: r.name, entry: "column_s8", rows: full, mr: r.mr, nr: r.nr }
+        ["column_s8", "product_s8"].map(|entry| Tile { name: r.name, entry, rows: full, mr: r.mr, nr: r.nr })
     });
     for row in float.chain(int8).chain(columns).filter(|r| !r.name.ends_with("_scalar")) {
         let isa = row.name.rsplit('_').next().unwrap();

@@ -440,16 +440,17 @@ impl<'a> Job<'a> {
 
     /// q . mean key of a frame, per query, by the f32 tile.
     fn shifts(&self, unit: &Unit, q: &[f32], shift: &mut [[f32; LANES]]) {
-        for (p, shift) in shift.iter_mut().enumerate() {
-            *shift = [0.0; LANES];
+        let nv = self.kernels.gemm_f32.nr / NR;
+        for (p, shift) in (0..).step_by(nv).zip(shift.chunks_mut(nv)) {
+            shift.fill([0.0; LANES]);
             self.kernels.tile(Tile {
                 rows: 1,
-                panels: 1,
+                panels: shift.len(),
                 k: self.d,
                 a: &unit.mean[..self.d],
                 w: PanelData::F32(&q[p * NR * self.d..]),
                 w_stride: NR * self.d,
-                acc: shift,
+                acc: shift.as_flattened_mut(),
                 acc_stride: NR,
             });
         }
@@ -610,7 +611,7 @@ mod tests {
         }
     }
 
-    crate::gemm::s8::tile::gemm_s8_entries!(Wide, rows [1, 2, 4, 6, 8, 10, 12], panels [1, 2], full 12 x 2);
+    crate::gemm::s8::tile::gemm_s8_entries!(Wide, crate::simd::scalar::Scalar, rows [1, 2, 4, 6, 8, 10, 12], panels [1, 2], full 12 x 2);
 
     static WIDE: GemmS8Kernel = GemmS8Kernel {
         name: "gemm_s8_12x32_test",
@@ -623,6 +624,7 @@ mod tests {
         run: gemm_s8,
         windows: conv_s8,
         column: column_s8,
+        product: product_s8,
         peak: peak_s8,
     };
 

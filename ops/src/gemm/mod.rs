@@ -92,20 +92,28 @@ impl Sink for RowSink<'_> {
             // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
             #[allow(unsafe_code)]
             let out = unsafe { self.out.slice(at..at + cols) };
-            match (self.add, out.as_chunks_mut::<NR>().0) {
+            let other = match self.add {
+                AddTo::Other(x) => &x.row(row + r)[col..][..cols],
+                _ => &[],
+            };
+            match (self.add, out.as_chunks_mut::<NR>().0, other.as_chunks::<NR>().0) {
                 // Whole vectors of 16: the compiler keeps them in registers.
-                (AddTo::Nothing, [out]) => *out = *y,
-                (AddTo::Output, [out]) => (0..NR).for_each(|i| out[i] += y[i]),
-                (AddTo::Nothing, _) => out.copy_from_slice(&y[..cols]),
-                (AddTo::Output, _) => out.iter_mut().zip(y).for_each(|(o, y)| *o += y),
-                (AddTo::Other(x), _) => {
-                    let x = &x.row(row + r)[col..][..cols];
-                    for i in 0..cols {
-                        out[i] = x[i] + y[i];
-                    }
-                }
+                (AddTo::Nothing, [out], _) => *out = *y,
+                (AddTo::Output, [out], _) => (0..NR).for_each(|i| out[i] += y[i]),
+                (AddTo::Other(_), [out], [x]) => (0..NR).for_each(|i| out[i] = x[i] + y[i]),
+                _ => put_narrow(self.add, y, other, out),
             }
         }
+    }
+}
+
+/// Less than sixteen columns. Apart, or the compiler merges its copy with that of whole vectors into a call of the C library.
+#[inline(never)]
+fn put_narrow(add: AddTo, y: &[f32; NR], other: &[f32], out: &mut [f32]) {
+    match add {
+        AddTo::Nothing => out.copy_from_slice(&y[..out.len()]),
+        AddTo::Output => out.iter_mut().zip(y).for_each(|(o, y)| *o += y),
+        AddTo::Other(_) => out.iter_mut().zip(other).zip(y).for_each(|((o, x), y)| *o = x + y),
     }
 }
 

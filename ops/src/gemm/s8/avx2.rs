@@ -91,4 +91,4 @@ impl Dot8 for Avx2 {
     }
 }
 
-super::tile::gemm_s8_entries!(Avx2, rows [1, 2, 3, 4], panels [1], full 4 x 1, "avx2,fma,f16c");
+super::tile::gemm_s8_entries!(Avx2, crate::simd::avx2::Avx2, rows [1, 2, 3, 4], panels [1], full 4 x 1, "avx2,fma,f16c");

@@ -89,4 +89,4 @@ impl Dot8 for Avx2Wide {
     }
 }
 
-super::tile::gemm_s8_entries!(Avx2Wide, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "avx2,fma,f16c");
+super::tile::gemm_s8_entries!(Avx2Wide, crate::simd::avx2::Avx2, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "avx2,fma,f16c");

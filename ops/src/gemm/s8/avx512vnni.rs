@@ -69,7 +69,7 @@ impl Dot8 for Avx512Vnni {
 }
 
 super::tile::gemm_s8_entries!(
-    Avx512Vnni,
+    Avx512Vnni, crate::simd::avx512::Avx512,
     rows [1, 2, 4, 6, 8, 10, 12],
     panels [1, 2], full 12 x 2,
     "avx2,fma,f16c,avx512f,avx512bw,avx512vl,avx512dq,avx512vnni"

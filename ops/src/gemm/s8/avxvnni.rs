@@ -74,4 +74,4 @@ impl Dot8 for AvxVnni {
     }
 }
 
-super::tile::gemm_s8_entries!(AvxVnni, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "avx2,fma,f16c,avxvnni");
+super::tile::gemm_s8_entries!(AvxVnni, crate::simd::avx2::Avx2, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "avx2,fma,f16c,avxvnni");

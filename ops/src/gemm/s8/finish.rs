@@ -5,7 +5,7 @@ use super::tile::MAX_NV;
 use crate::activation::{Gelu, Relu, gelu_lanes, relu_lanes};
 use crate::gemm::Act;
 use crate::par::SharedMut;
-use crate::simd::{LANES, Lanewise, Simd, Vector};
+use crate::simd::{LANES, Lanewise, Simd, Vector, padded};
 
 /// What is added to an output when it is stored.
 #[derive(Clone, Copy)]
@@ -18,6 +18,7 @@ pub(crate) enum Plus<'a> {
 }
 
 /// The epilogue of one tile of sums.
+#[derive(Clone, Copy)]
 pub(crate) struct FinishS8<'a> {
     /// `[panel][row][16]`.
     pub acc: &'a [i32],
@@ -67,26 +68,37 @@ impl ColumnsS8 {
         for v in 0..panels {
             let col = (panel + v) * LANES;
             let cols = LANES.min(w.n - col);
-            columns.scales[v][..cols].copy_from_slice(&w.scales[col..col + cols]);
+            columns.scales[v] = sixteen(&w.scales[col..], cols);
             if let Some(bias) = bias {
-                for (i, b) in columns.bias[v][..cols].iter_mut().enumerate() {
-                    *b = bias[(col + i) % bias.len()];
+                match bias.get(col..col + cols) {
+                    Some(bias) => columns.bias[v] = sixteen(bias, cols),
+                    None => {
+                        for (i, b) in columns.bias[v][..cols].iter_mut().enumerate() {
+                            *b = bias[(col + i) % bias.len()];
+                        }
+                    }
                 }
             }
             if let Some(gamma) = gamma {
-                columns.gamma[v][..cols].copy_from_slice(&gamma[col..col + cols]);
+                columns.gamma[v] = sixteen(&gamma[col..], cols);
             }
         }
         columns
     }
 
-    /// Without the first `panels` panels.
-    pub(crate) fn from(&self, panels: usize) -> ColumnsS8 {
-        let mut columns = *self;
-        columns.scales.rotate_left(panels);
-        columns.bias.rotate_left(panels);
-        columns.gamma.rotate_left(panels);
+    /// Panel `p` alone.
+    pub(crate) fn panel(&self, p: usize) -> ColumnsS8 {
+        let mut columns = ColumnsS8::default();
+        (columns.scales[0], columns.bias[0], columns.gamma[0]) = (self.scales[p], self.bias[p], self.gamma[p]);
         columns
+    }
+}
+
+/// The first `cols` values, zeros behind them. Sixteen as one copy of known size: of unknown size it is a call of the C library.
+fn sixteen(x: &[f32], cols: usize) -> [f32; LANES] {
+    match x.first_chunk::<LANES>() {
+        Some(x) if cols == LANES => *x,
+        _ => padded(&x[..cols], 0.0),
     }
 }
 

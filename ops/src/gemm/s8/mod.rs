@@ -9,6 +9,7 @@
 //! | `pack.rs` | K4N16 panels, rows as they lie in memory |
 //! | `rows.rs` | rows of activations in the order of a tile |
 //! | `tile.rs` | the tile over `Dot8` |
+//! | `product.rs` | full tiles below one another with their epilogue |
 //! | `ahead.rs` | what a tile asks the caches for meanwhile |
 //! | `finish.rs` | the epilogue |
 //! | `table.rs` | the kernels |
@@ -29,6 +30,7 @@ pub(crate) mod neon;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neondot;
 pub mod pack;
+pub(crate) mod product;
 pub(crate) mod rows;
 pub(crate) mod scalar;
 pub mod table;
@@ -44,6 +46,7 @@ use crate::quantize::{Before, QuantizeRow};
 use ahead::Ahead;
 use finish::{ColumnsS8, FinishS8, Plus};
 use pack::{PanelsS8, QUAD, RowsS8, RowsS8Mut, STEP, padded_k};
+use product::ProductS8;
 use rows::{QuadPack, WidePack};
 use table::{Activations, GemmS8Kernel};
 use tile::{MAX_NV, TileS8};
@@ -173,9 +176,9 @@ fn pack_block(ctx: Ctx, p: &Product, rows: std::ops::Range<usize>, packed: &mut 
         let (steps, width) = (width / QUAD, p.kernel.fit(here));
         let out = &mut packed[r * words..][..p.kernel.mr * words];
         if p.kernel.bytes == 1 {
-            ctx.kernels.pack_quads(QuadPack { from, steps, width, flip, out: bytemuck::cast_slice_mut(out) });
+            ctx.kernels.pack_quads(QuadPack { from: &from, steps, width, flip, out: bytemuck::cast_slice_mut(out) });
         } else {
-            ctx.kernels.pack_wide(WidePack { from, steps, width, out: bytemuck::cast_slice_mut(out) });
+            ctx.kernels.pack_wide(WidePack { from: &from, steps, width, out: bytemuck::cast_slice_mut(out) });
         }
     }
 }
@@ -216,23 +219,43 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
     let size = mr * NR * part.panels;
     let block = STEPS / p.kernel.bytes;
     let quad = QUAD * p.kernel.bytes;
-    let tiles = part.rows.div_ceil(mr);
+    // Bytes of the next panels for each step of each tile.
+    let per_step = part.panels * STEP / part.rows.div_ceil(mr);
+    let next_panels = w.as_ptr().wrapping_add(part.panels * steps * STEP);
+    let mut done = 0;
+    if steps <= block
+        && let Sink::Values { .. } = p.sink
+    {
+        // Nothing to be continued: whole tiles in one call.
+        let full = part.rows - part.rows % mr;
+        ctx.kernels.product_tiles_s8(
+            p.few,
+            ProductS8 {
+                kernels: ctx.kernels,
+                panels: part.panels,
+                steps,
+                a: &packed[..full * steps * quad],
+                w,
+                start: &start,
+                finish: epilogue(p, Part { rows: full, ..part }, (&columns, &[])),
+                acc: &mut acc[..size],
+                next: next_panels,
+                per_step,
+            },
+        );
+        done = full;
+    }
     let mut s0 = 0;
     loop {
         let here = block.min(steps - s0);
+        let next = next_panels.wrapping_add(s0 * part.panels * STEP);
         let last = s0 + here == steps;
-        for (tile, r) in (0..part.rows).step_by(mr).enumerate() {
-            let rows = mr.min(part.rows - r);
+        for r in (done..part.rows).step_by(mr) {
+            let (tile, rows) = (r / mr, mr.min(part.rows - r));
             let width = p.kernel.fit(rows);
             let acc = &mut acc[tile * size..][..size];
-            // The outputs after the last block, and a share of the next panels: those come from beyond the second-level cache.
-            let mut ahead = Ahead::nothing(packed).with_weights(
-                w.as_ptr()
-                    .wrapping_add((part.panels * steps + (s0 * tiles + tile * here) * part.panels / tiles) * STEP),
-                part.panels * STEP / tiles,
-                width * part.panels,
-                here,
-            );
+            // A share of the next panels, which come from beyond the second-level cache, and after the last block the outputs.
+            let mut ahead = Ahead::nothing(packed).with_weights(next.wrapping_add(tile * here * per_step), per_step);
             if last && let Sink::Values { out, stride, first, .. } = &p.sink {
                 ahead = ahead.with_outputs(out.at((part.first + r - first) * stride + part.panel * NR), *stride);
             }
@@ -262,38 +285,41 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
 
 /// Sums of one tile to the output.
 fn finish_tile(ctx: Ctx, p: &Product, part: Part, (columns, acc): (&ColumnsS8, &[i32])) {
+    let Sink::Sums(out) = &p.sink else {
+        ctx.kernels.finish_s8(epilogue(p, part, (columns, acc)));
+        return;
+    };
     let col = part.panel * NR;
     let cols = (part.panels * NR).min(p.w.n - col);
-    let acc_stride = p.kernel.mr * NR;
-    match &p.sink {
-        Sink::Sums(out) => {
-            for r in 0..part.rows {
-                let at = (part.first + r) * p.w.n + col;
-                // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
-                #[allow(unsafe_code)]
-                let out = unsafe { out.slice(at..at + cols) };
-                for (v, out) in out.chunks_mut(NR).enumerate() {
-                    out.copy_from_slice(&acc[v * acc_stride + r * NR..][..out.len()]);
-                }
-            }
+    for r in 0..part.rows {
+        let at = (part.first + r) * p.w.n + col;
+        // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
+        #[allow(unsafe_code)]
+        let out = unsafe { out.slice(at..at + cols) };
+        for (v, out) in out.chunks_mut(NR).enumerate() {
+            out.copy_from_slice(&acc[v * p.kernel.mr * NR + r * NR..][..out.len()]);
         }
-        Sink::Values { ep, out, stride, first } => {
-            ctx.kernels.finish_s8(FinishS8 {
-                acc,
-                acc_stride,
-                panels: part.panels,
-                row_scales: &p.a.scales[part.first..part.first + part.rows],
-                columns,
-                act: ep.act,
-                gamma: ep.gamma.is_some(),
-                plus: if ep.residual { Plus::Output } else { Plus::Nothing },
-                relu_sum: false,
-                out,
-                at: (part.first - first) * stride + col,
-                stride: *stride,
-                cols,
-            });
-        }
+    }
+}
+
+/// The epilogue of some rows of a group of panels, for a product that has one.
+fn epilogue<'a>(p: &'a Product, part: Part, (columns, acc): (&'a ColumnsS8, &'a [i32])) -> FinishS8<'a> {
+    let Sink::Values { ep, out, stride, first } = &p.sink else { panic!("sums have no epilogue") };
+    let col = part.panel * NR;
+    FinishS8 {
+        acc,
+        acc_stride: p.kernel.mr * NR,
+        panels: part.panels,
+        row_scales: &p.a.scales[part.first..part.first + part.rows],
+        columns,
+        act: ep.act,
+        gamma: ep.gamma.is_some(),
+        plus: if ep.residual { Plus::Output } else { Plus::Nothing },
+        relu_sum: false,
+        out,
+        at: (part.first - first) * stride + col,
+        stride: *stride,
+        cols: (part.panels * NR).min(p.w.n - col),
     }
 }
 

@@ -141,4 +141,4 @@ impl Dot8 for Neon {
     }
 }
 
-super::tile::gemm_s8_entries!(Neon, rows [1, 2, 3, 4], panels [1], full 4 x 1, "neon");
+super::tile::gemm_s8_entries!(Neon, crate::simd::neon::Neon, rows [1, 2, 3, 4], panels [1], full 4 x 1, "neon");

@@ -158,4 +158,4 @@ impl Dot8 for NeonDot {
     }
 }
 
-super::tile::gemm_s8_entries!(NeonDot, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "neon,dotprod");
+super::tile::gemm_s8_entries!(NeonDot, crate::simd::neon::Neon, rows [1, 2, 3, 4, 5, 6], panels [1], full 6 x 1, "neon,dotprod");

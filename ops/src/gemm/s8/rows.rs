@@ -3,12 +3,12 @@
 use super::pack::QUAD;
 use crate::gemm::pack::MAX_MR;
 use crate::prefetch::near_l1;
-use crate::simd::{LANES, Simd};
+use crate::simd::{LANES, Simd, Vector};
 
 /// Rows of int8 activations to be packed for a tile: `out[step][r] = from[r][4 step..][..4] ^ flip`.
 pub(crate) struct QuadPack<'a> {
     /// At least `4 * steps` values each; an empty row is zeros.
-    pub from: [&'a [i8]; MAX_MR],
+    pub from: &'a [&'a [i8]; MAX_MR],
     /// Steps of four values.
     pub steps: usize,
     /// Rows of the tile.
@@ -22,7 +22,7 @@ pub(crate) struct QuadPack<'a> {
 /// Rows of int8 activations to be packed for a tile of 16-bit activations: `out[step][r] = from[r][4 step..][..4]`.
 pub(crate) struct WidePack<'a> {
     /// At least `4 * steps` values each; an empty row is zeros.
-    pub from: [&'a [i8]; MAX_MR],
+    pub from: &'a [&'a [i8]; MAX_MR],
     /// Steps of four values.
     pub steps: usize,
     /// Rows of the tile.
@@ -34,19 +34,21 @@ pub(crate) struct WidePack<'a> {
 /// Packs rows of bytes.
 #[inline(always)]
 pub(crate) fn pack_quads<S: Simd>(s: S, t: QuadPack) {
-    transposed(s, &t.from, (t.steps, t.width), t.out, t.flip);
+    transposed(s, t.from, (t.steps, t.width), t.out, t.flip);
 }
 
 /// Packs rows of bytes as 16-bit values.
 #[inline(always)]
 pub(crate) fn pack_wide<S: Simd>(s: S, t: WidePack) {
-    transposed(s, &t.from, (t.steps, t.width), t.out, 0);
+    transposed(s, t.from, (t.steps, t.width), t.out, 0);
 }
 
 /// A packed quad. Functions, not closures: those lose the instruction set where they are not inlined.
 trait Quad: Copy {
     /// Of sixteen quads of bytes.
     fn of(quads: &[f32; LANES], flip: u32) -> [Self; LANES];
+    /// To memory, through registers.
+    fn put<S: Simd>(s: S, quads: &[Self; LANES], to: &mut [Self; LANES]);
 }
 
 impl Quad for u32 {
@@ -57,6 +59,11 @@ impl Quad for u32 {
             out[i] = quads[i].to_bits() ^ flip;
         }
         out
+    }
+
+    #[inline(always)]
+    fn put<S: Simd>(s: S, quads: &[u32; LANES], to: &mut [u32; LANES]) {
+        s.load(bytemuck::cast_ref(quads)).store(bytemuck::cast_mut(to));
     }
 }
 
@@ -71,6 +78,41 @@ impl Quad for [i16; QUAD] {
             }
         }
         out
+    }
+
+    #[inline(always)]
+    fn put<S: Simd>(s: S, quads: &[[i16; QUAD]; LANES], to: &mut [[i16; QUAD]; LANES]) {
+        let quads: &[[f32; LANES]; 2] = bytemuck::cast_ref(quads);
+        let to: &mut [[f32; LANES]; 2] = bytemuck::cast_mut(to);
+        for i in 0..2 {
+            s.load(&quads[i]).store(&mut to[i]);
+        }
+    }
+}
+
+/// The first `width` of sixteen quads to `out` from `at` on. All of them where there is room: what runs over is written again by the
+/// next step. Through registers: as a copy it is merged with the other one into a call of the C library.
+#[inline(always)]
+fn put_some<S: Simd, Q: Quad>(s: S, quads: &[Q; LANES], out: &mut [Q], (at, width): (usize, usize)) {
+    match out[at..].first_chunk_mut::<LANES>() {
+        Some(to) => Q::put(s, quads, to),
+        None => out[at..at + width].copy_from_slice(&quads[..width]),
+    }
+}
+
+/// The first `width` quads of each of `steps`, flipped.
+#[inline(always)]
+pub(crate) fn cut<'a, S: Simd>(
+    s: S,
+    steps: impl Iterator<Item = &'a [u32]>,
+    (width, flip): (usize, u32),
+    out: &mut [u32],
+) {
+    let mut at = 0;
+    for from in steps {
+        let from = from.first_chunk::<LANES>().expect("a vector of slack");
+        put_some(s, &u32::of(bytemuck::cast_ref(from), flip), out, (at, width));
+        at += width;
     }
 }
 
@@ -110,13 +152,7 @@ fn transposed<S: Simd, Q: Quad>(
         }
         s.transpose(&mut block);
         for (i, lanes) in block[..len].iter().enumerate() {
-            let at = (q0 + i) * width;
-            let quads = Q::of(lanes, flip);
-            // Sixteen at once where there is room: what runs over is written again by the next step.
-            match out[at..].first_chunk_mut::<LANES>() {
-                Some(to) => *to = quads,
-                None => out[at..at + width].copy_from_slice(&quads[..width]),
-            }
+            put_some(s, &Q::of(lanes, flip), out, ((q0 + i) * width, width));
         }
         q0 += len;
     }

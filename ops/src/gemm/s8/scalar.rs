@@ -59,4 +59,4 @@ impl Dot8 for Scalar {
     }
 }
 
-super::tile::gemm_s8_entries!(Scalar, rows [1, 2, 4], panels [1], full 4 x 1);
+super::tile::gemm_s8_entries!(Scalar, crate::simd::scalar::Scalar, rows [1, 2, 4], panels [1], full 4 x 1);

@@ -2,6 +2,7 @@
 #![allow(unsafe_code)]
 
 use super::finish::FinishS8;
+use super::product::ProductS8;
 use super::rows::{QuadPack, WidePack};
 use super::scalar;
 use super::tile::{ColumnS8, TileS8};
@@ -44,6 +45,8 @@ pub struct GemmS8Kernel {
     pub(crate) windows: unsafe fn(TileS8, Windows),
     /// Tiles of packed rows below one another.
     pub(crate) column: unsafe fn(ColumnS8),
+    /// Full tiles of a product with their epilogue.
+    pub(crate) product: unsafe fn(ProductS8),
     pub(crate) peak: unsafe fn(i32) -> i32,
 }
 
@@ -77,6 +80,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: avx512vnni::gemm_s8,
         windows: avx512vnni::conv_s8,
         column: avx512vnni::column_s8,
+        product: avx512vnni::product_s8,
         peak: avx512vnni::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -91,6 +95,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: avxvnni::gemm_s8,
         windows: avxvnni::conv_s8,
         column: avxvnni::column_s8,
+        product: avxvnni::product_s8,
         peak: avxvnni::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -105,6 +110,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: avx2wide::gemm_s8,
         windows: avx2wide::conv_s8,
         column: avx2wide::column_s8,
+        product: avx2wide::product_s8,
         peak: avx2wide::peak_s8,
     },
     #[cfg(target_arch = "x86_64")]
@@ -119,6 +125,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: avx2::gemm_s8,
         windows: avx2::conv_s8,
         column: avx2::column_s8,
+        product: avx2::product_s8,
         peak: avx2::peak_s8,
     },
     #[cfg(target_arch = "aarch64")]
@@ -133,6 +140,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: neondot::gemm_s8,
         windows: neondot::conv_s8,
         column: neondot::column_s8,
+        product: neondot::product_s8,
         peak: neondot::peak_s8,
     },
     #[cfg(target_arch = "aarch64")]
@@ -147,6 +155,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: neon::gemm_s8,
         windows: neon::conv_s8,
         column: neon::column_s8,
+        product: neon::product_s8,
         peak: neon::peak_s8,
     },
     GemmS8Kernel {
@@ -160,6 +169,7 @@ pub static GEMM_S8: &[GemmS8Kernel] = &[
         run: scalar::gemm_s8,
         windows: scalar::conv_s8,
         column: scalar::column_s8,
+        product: scalar::product_s8,
         peak: scalar::peak_s8,
     },
 ];
@@ -179,6 +189,13 @@ impl Kernels {
     pub(crate) fn product_tile_s8(&self, few: bool, tile: TileS8) {
         // SAFETY: chosen under the detected features.
         unsafe { (self.products_s8(few).run)(tile, ()) }
+    }
+
+    /// Runs full tiles of `product_s8`, or of `gemm_s8` with `few` rows, with their epilogue.
+    #[inline]
+    pub(crate) fn product_tiles_s8(&self, few: bool, tiles: ProductS8) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.products_s8(few).product)(tiles) }
     }
 
     /// The row for products: `product_s8`, or `gemm_s8` with `few` rows.

@@ -144,7 +144,7 @@ impl ColumnS8<'_> {
 
 /// Sums of a tile in registers: from `start`, or from where the last block left them.
 #[inline(always)]
-fn begin<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, t: &TileS8) -> [[D::Acc; NV]; MR] {
+pub(super) fn begin<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, t: &TileS8) -> [[D::Acc; NV]; MR] {
     let mut acc = [[d.zero(); NV]; MR];
     for v in 0..NV {
         let sums = &t.acc[v * t.acc_stride..][..MR * LANES].as_chunks::<LANES>().0[..MR];
@@ -157,7 +157,12 @@ fn begin<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, t: &TileS
 
 /// Sums of a tile to memory.
 #[inline(always)]
-fn end<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, acc: &[[D::Acc; NV]; MR], t: &mut TileS8) {
+pub(super) fn end<D: Dot8, const MR: usize, const NV: usize>(
+    d: D,
+    pass: usize,
+    acc: &[[D::Acc; NV]; MR],
+    t: &mut TileS8,
+) {
     for v in 0..NV {
         let sums = &mut t.acc[v * t.acc_stride..][..MR * LANES].as_chunks_mut::<LANES>().0[..MR];
         for r in 0..MR {
@@ -166,42 +171,53 @@ fn end<D: Dot8, const MR: usize, const NV: usize>(d: D, pass: usize, acc: &[[D::
     }
 }
 
-/// The tile of packed rows with `MR` rows and `NV` panels; all sums of a pass stay in registers.
+/// The sums of a pass and on top the products of packed rows; by value, or they would pass through the stack.
 #[inline(always)]
-pub(crate) fn packed<D: Dot8, const MR: usize, const NV: usize>(d: D, mut t: TileS8, (): ()) {
+pub(super) fn multiply<D: Dot8, const MR: usize, const NV: usize>(
+    d: D,
+    pass: usize,
+    t: &TileS8,
+    mut acc: [[D::Acc; NV]; MR],
+) -> [[D::Acc; NV]; MR] {
     let steps = t.steps;
     let a: &[D::Elem] = bytemuck::cast_slice(t.a);
     let a = &a.as_chunks::<QUAD>().0.as_chunks::<MR>().0[..steps];
-    for pass in 0..D::PASSES {
-        let mut acc = begin::<D, MR, NV>(d, pass, &t);
-        let mut panels: [&[[i8; STEP]]; NV] = [&[]; NV];
+    let mut panels: [&[[i8; STEP]]; NV] = [&[]; NV];
+    for v in 0..NV {
+        panels[v] = &t.w[v * t.w_stride..].as_chunks::<STEP>().0[..steps];
+    }
+    let mut asking = t.ahead.over::<NV>(MR, steps);
+    let mut done = 0;
+    while done < steps {
+        let here = asking.next(D::AHEAD, done);
+        let a = &a[done..][..here];
+        let mut now: [&[[i8; STEP]]; NV] = [&[]; NV];
         for v in 0..NV {
-            panels[v] = &t.w[v * t.w_stride..].as_chunks::<STEP>().0[..steps];
+            now[v] = &panels[v][done..][..here];
         }
-        let mut asking = t.ahead.over::<NV>(MR, steps);
-        let mut done = 0;
-        while done < steps {
-            let here = asking.next(D::AHEAD, done);
-            let a = &a[done..][..here];
-            let mut now: [&[[i8; STEP]]; NV] = [&[]; NV];
-            for v in 0..NV {
-                now[v] = &panels[v][done..][..here];
-            }
-            for i in 0..here {
-                if D::AHEAD {
-                    near_l1(a.as_ptr().wrapping_add(i + EARLY));
-                    for v in 0..NV {
-                        near_l1(now[v].as_ptr().wrapping_add(i + EARLY));
-                    }
+        for i in 0..here {
+            if D::AHEAD {
+                near_l1(a.as_ptr().wrapping_add(i + EARLY));
+                for v in 0..NV {
+                    near_l1(now[v].as_ptr().wrapping_add(i + EARLY));
                 }
-                let mut w = [d.load_w(pass, &now[0][i]); NV];
-                for v in 1..NV {
-                    w[v] = d.load_w(pass, &now[v][i]);
-                }
-                d.step(&mut acc, &a[i], &w);
             }
-            done += here;
+            let mut w = [d.load_w(pass, &now[0][i]); NV];
+            for v in 1..NV {
+                w[v] = d.load_w(pass, &now[v][i]);
+            }
+            d.step(&mut acc, &a[i], &w);
         }
+        done += here;
+    }
+    acc
+}
+
+/// The tile of packed rows with `MR` rows and `NV` panels.
+#[inline(always)]
+pub(crate) fn packed<D: Dot8, const MR: usize, const NV: usize>(d: D, mut t: TileS8, (): ()) {
+    for pass in 0..D::PASSES {
+        let acc = multiply(d, pass, &t, begin::<D, MR, NV>(d, pass, &t));
         end(d, pass, &acc, &mut t);
     }
 }
@@ -290,12 +306,14 @@ pub(crate) fn peak_body<D: Dot8, const MR: usize, const NV: usize>(d: D, seed: i
     sums.as_flattened().as_flattened().iter().fold(0, |x, y| x ^ y)
 }
 
-/// `gemm_s8`, `conv_s8`, `column_s8` and `peak_s8` of one instruction set: one body per row count and panel count.
+/// `gemm_s8`, `conv_s8`, `column_s8`, `product_s8` and `peak_s8` of one instruction set: one body per row count and panel count.
+/// The second name is the token of its vectors.
 macro_rules! gemm_s8_entries {
-    ($token:ident, rows $rows:tt, panels $panels:tt, full $mr:literal x $nv:literal $(, $features:literal)?) => {
+    ($token:ident, $vector:path, rows $rows:tt, panels $panels:tt, full $mr:literal x $nv:literal $(, $features:literal)?) => {
         crate::gemm::s8::tile::s8_entry!(gemm_s8, packed, (), $token, $rows, $panels $(, $features)?);
         crate::gemm::s8::tile::s8_entry!(conv_s8, windows, crate::gemm::tile::Windows, $token, $rows, $panels $(, $features)?);
         crate::gemm::s8::tile::s8_column!($token, $rows, $panels, $mr $(, $features)?);
+        crate::gemm::s8::product::s8_product!($token, $vector, $panels, $mr $(, $features)?);
 
         /// Peak probe.
         $(#[target_feature(enable = $features)])?
