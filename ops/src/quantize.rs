@@ -122,20 +122,15 @@ fn largest<S: Simd>(s: S, x: &[f32], relu: bool) -> (f32, bool) {
     largest_number(max)
 }
 
-/// The largest of magnitudes by their bits, in every lane.
+/// The largest of magnitudes by their bits, and whether it is finite.
 #[inline(always)]
-pub(crate) fn largest_lane<V: Vector>(v: V) -> V {
+pub(crate) fn largest_number<V: Vector>(v: V) -> (f32, bool) {
     let v = v.max_magnitude(v.swap::<8>());
     let v = v.max_magnitude(v.swap::<4>());
     let v = v.max_magnitude(v.swap::<2>());
-    v.max_magnitude(v.swap::<1>())
-}
-
-/// The largest of magnitudes by their bits, and whether it is finite.
-#[inline(always)]
-fn largest_number<V: Vector>(v: V) -> (f32, bool) {
+    let v = v.max_magnitude(v.swap::<1>());
     let mut lanes = [0.0f32; LANES];
-    largest_lane(v).store(&mut lanes);
+    v.store(&mut lanes);
     (lanes[0], lanes[0].is_finite())
 }
 
@@ -190,14 +185,35 @@ pub(crate) fn quantize_row<S: Simd>(s: S, row: QuantizeRow) -> f32 {
     for (x, y) in xb.iter().zip(yb.iter_mut()) {
         (s.load(x) * k).store_s8(y);
     }
-    // What is left of the padded row: less than 16 values, or a whole 16 of which x has 13 to 15.
-    let mut bytes = [0i8; LANES];
-    (s.load(&padded(xt, 0.0)) * k).store_s8(&mut bytes);
-    match yb.get_mut(xb.len()) {
-        Some(y) => *y = bytes,
-        None => yt.copy_from_slice(&bytes[..yt.len()]),
+    if !xt.is_empty() {
+        // What is left of the padded row: less than 16 values, or a whole 16 of which x has 13 to 15.
+        let mut bytes = [0i8; LANES];
+        (s.load(&padded(xt, 0.0)) * k).store_s8(&mut bytes);
+        match yb.get_mut(xb.len()) {
+            Some(y) => *y = bytes,
+            None => few(&bytes, yt),
+        }
     }
     max / 127.0 * factor
+}
+
+/// The first of sixteen values to fewer than sixteen, in pieces of known size: a copy of unknown size is a call of the C library.
+#[inline(always)]
+fn few<T: Copy>(values: &[T; LANES], out: &mut [T]) {
+    let mut at = 0;
+    macro_rules! piece {
+        ($n:literal) => {
+            if let (Some(to), Some(from)) = (out[at..].first_chunk_mut::<$n>(), values[at..].first_chunk::<$n>()) {
+                *to = *from;
+                at += $n;
+            }
+        };
+    }
+    piece!(8);
+    piece!(4);
+    piece!(2);
+    piece!(1);
+    debug_assert!(at == out.len());
 }
 
 /// max |x|, of the rectified values with `relu`; NaN when a value is not finite.
@@ -371,7 +387,7 @@ fn quantize_run<S: Simd, T: MapValue>(s: S, x: &[f32], relu: bool, inverse: f32,
     let tail = T::of(&quantized(s, s.load(&padded(xt, 0.0)), relu, inverse), flip);
     match rest {
         Some(y) => *y = tail,
-        None => yt.copy_from_slice(&tail[..yt.len()]),
+        None => few(&tail, yt),
     }
 }
 

@@ -4,12 +4,13 @@
 //! vectors. Norm and embedding are also those of [`crate::rope::qk_norm_rope`].
 
 use crate::gemm::s8::pack::QUAD;
+use crate::gemm::s8::rows::cut;
 use crate::gemm::s8::table::{Activations, GemmS8Kernel};
 use crate::hadamard::{Rotation, rotate};
 use crate::prefetch::near_l1;
-use crate::quantize::largest_lane;
+use crate::quantize::largest_number;
 use crate::rope::{RopeTable, turn};
-use crate::simd::{LANES, Simd, Vector, fold_lanes};
+use crate::simd::{LANES, Simd, Vector, fold_add};
 
 /// Widest head.
 pub(crate) const MAX_D: usize = 256;
@@ -115,8 +116,8 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
         padded_offset.as_flattened_mut()[..offset.len()].copy_from_slice(offset);
         (&padded_gain[..n], &padded_offset[..n])
     };
-    let count = s.splat(d as f32);
-    let eps = s.splat(norm.map_or(0.0, |n| n.eps));
+    let count = d as f32;
+    let eps = norm.map_or(0.0, |n| n.eps);
     let mut row = [0.0f32; MAX_D + LANES];
     for r in 0..rows {
         let mut v = [zero; MAX_N];
@@ -144,7 +145,8 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
             for i in 0..n {
                 sum = sum + v[i];
             }
-            let mean = fold_lanes(sum) / count;
+            // Quotients and the root as numbers: with 16 lanes they take four times as long, six of them a third of a row's time.
+            let mean = s.splat(fold_add(sum) / count);
             let mut squares = zero;
             for i in 0..n {
                 v[i] = v[i] - mean;
@@ -153,7 +155,7 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
                 }
                 squares = v[i].mul_add(v[i], squares);
             }
-            let k = s.splat(1.0) / (fold_lanes(squares) / count + eps).sqrt();
+            let k = s.splat(1.0 / (fold_add(squares) / count + eps).sqrt());
             for i in 0..n {
                 v[i] = (v[i] * k).mul_add(s.load(&gain[i]), s.load(&offset[i]));
             }
@@ -235,22 +237,18 @@ fn quantize_centred<S: Simd>(s: S, x: &[[f32; LANES]], mean: Option<&[[f32; LANE
         }
         max = v[i].max_magnitude(max);
     }
-    let max = largest_lane(max);
+    let (max, finite) = largest_number(max);
     let out = &mut out[..n];
-    let top = s.splat(127.0);
-    let inverse = top / max;
-    // Both sides of 127 / max must be finite; magnitudes by their bits are infinite or NaN where a value is.
-    let (finite, small) = (s.splat(f32::INFINITY).gt_bits(max) == u16::MAX, inverse.gt_bits(s.splat(f32::MAX)) != 0);
-    if !finite || small {
+    let inverse = 127.0 / max;
+    if !finite || !inverse.is_finite() {
         out.fill([0; LANES]);
         return if finite { 0.0 } else { f32::NAN };
     }
+    let k = s.splat(inverse);
     for i in 0..n {
-        (v[i] * inverse).store_s8(&mut out[i]);
+        (v[i] * k).store_s8(&mut out[i]);
     }
-    let mut scale = [0.0; LANES];
-    (max / top).store(&mut scale);
-    scale[0]
+    max / 127.0
 }
 
 /// Bytes of up to 16 rows `[16, blocks of 64]` -> quads `[steps][stride]` from `out` on, transposed; rows beyond `rows` are zeros.
@@ -273,31 +271,20 @@ fn transpose_quads<S: Simd>(s: S, bytes: &[f32], (blocks, steps): (usize, usize)
 
 /// Quads `[steps][stride]` of `rows` rows, cut into the tiles of a kernel: for each tile `[steps][rows of the tile]`.
 #[inline(always)]
-fn cut_tiles(stage: &[u32], stride: usize, (steps, rows): (usize, usize), kernel: &GemmS8Kernel, out: &mut [u32]) {
+fn cut_tiles<S: Simd>(
+    s: S,
+    stage: &[u32],
+    stride: usize,
+    (steps, rows): (usize, usize),
+    kernel: &GemmS8Kernel,
+    out: &mut [u32],
+) {
     let flip = flip(kernel);
     for r in (0..rows).step_by(kernel.mr) {
         let width = kernel.fit(kernel.mr.min(rows - r));
         let out = &mut out[r * steps..][..width * steps];
         let from = stage[r..].chunks(stride).take(steps);
-        match width {
-            0..=4 => cut_tile::<4>(from, (width, flip), out),
-            5..=8 => cut_tile::<8>(from, (width, flip), out),
-            _ => cut_tile::<16>(from, (width, flip), out),
-        }
-    }
-}
-
-/// The first `width` quads of each step, `G` at once where there is room: what runs over is written again by the next step.
-#[inline(always)]
-fn cut_tile<'a, const G: usize>(steps: impl Iterator<Item = &'a [u32]>, (width, flip): (usize, u32), out: &mut [u32]) {
-    let mut at = 0;
-    for from in steps {
-        let quads = from.first_chunk::<G>().expect("a vector of slack").map(|v| v ^ flip);
-        match out[at..].first_chunk_mut::<G>() {
-            Some(to) => *to = quads,
-            None => out[at..at + width].copy_from_slice(&quads[..width]),
-        }
-        at += width;
+        cut(s, from, (width, flip), out);
     }
 }
 
@@ -354,7 +341,7 @@ fn pack_keys_of<S: Simd>(s: S, t: KeyPack, n: usize) {
             }
             transpose_quads(s, bytes, (blocks, steps), &mut stage[r..], STAGE_ROWS);
         }
-        cut_tiles(stage, STAGE_ROWS, (steps, keys), kernel, &mut out[first * steps..]);
+        cut_tiles(s, stage, STAGE_ROWS, (steps, keys), kernel, &mut out[first * steps..]);
     }
 }
 
@@ -448,7 +435,7 @@ pub(crate) fn pack_values<S: Simd>(s: S, t: ValuePack) {
             let columns = (scale.expect("whole vectors"), sum.expect("whole vectors"));
             quantize_columns(s, (&block, keys), columns, (&mut stage[c..], width));
         }
-        cut_tiles(stage, width, (steps, d), kernel, &mut out[tile * tile_len..][..tile_len]);
+        cut_tiles(s, stage, width, (steps, d), kernel, &mut out[tile * tile_len..][..tile_len]);
     }
 }
 

@@ -190,21 +190,16 @@ const fn lanes_with(h: usize) -> u16 {
     lanes
 }
 
-/// Sum of the lanes in the one fixed order, l + (l+8), then +4, +2, +1, in every lane: addition commutes, so that the lanes'
-/// partners fold alike.
+/// Sum of the lanes in the one fixed order: l + (l+8), then +4, +2, +1.
 #[inline(always)]
-pub(crate) fn fold_lanes<V: Vector>(v: V) -> V {
+pub(crate) fn fold_add<V: Vector>(v: V) -> f32 {
+    // In every lane: addition commutes, so that the lanes' partners fold alike.
     let v = v + v.swap::<8>();
     let v = v + v.swap::<4>();
     let v = v + v.swap::<2>();
-    v + v.swap::<1>()
-}
-
-/// [`fold_lanes`] as a number.
-#[inline(always)]
-pub(crate) fn fold_add<V: Vector>(v: V) -> f32 {
+    let v = v + v.swap::<1>();
     let mut x = [0.0f32; LANES];
-    fold_lanes(v).store(&mut x);
+    v.store(&mut x);
     x[0]
 }
 
