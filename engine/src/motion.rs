@@ -58,17 +58,6 @@ pub(crate) enum Raw<'a> {
     Single(&'a [f32]),
 }
 
-impl Raw<'_> {
-    /// Raw v+ and v- of a pixel.
-    fn velocities(&self, u: usize) -> ([f32; 3], [f32; 3]) {
-        let three = |s: &[f32]| [s[0], s[1], s[2]];
-        match self {
-            Raw::Passes(f, b) => (three(&f[4 * u..]), three(&b[4 * u..])),
-            Raw::Single(s) => (three(&s[7 * u..]), three(&s[7 * u + 3..])),
-        }
-    }
-}
-
 /// A direction of time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Direction {
@@ -126,34 +115,41 @@ impl Map {
         self.seen
     }
 
-    fn world_velocity(&self, v: [f32; 3], factor: f32) -> [f32; 3] {
-        let v = v.map(|x| x * factor);
-        match &self.rotation {
-            Some(r) => std::array::from_fn(|i| r[i][0] * v[0] + r[i][1] * v[1] + r[i][2] * v[2]),
-            None => v,
+    /// Velocities of a row, world axes, scene units per second: those of `direction`, or, where it has no neighbour, the other's turned
+    /// round.
+    fn velocity_row(&self, raw: Raw, direction: Direction, out: &mut [[f32; 3]]) {
+        let (ahead, behind) = self.seen;
+        if !ahead && !behind {
+            return out.fill([0.0; 3]);
         }
-    }
-
-    /// v+ and v- of one pixel, world axes, scene units per second.
-    fn pixel(&self, raw: &Raw, u: usize) -> ([f32; 3], [f32; 3]) {
-        let (f, b) = raw.velocities(u);
-        let (f, b) = (self.world_velocity(f, self.factor.0), self.world_velocity(b, self.factor.1));
-        match self.seen {
-            (false, false) => ([0.0; 3], [0.0; 3]),
-            (false, true) if self.mirror => (b.map(|x| -x), b),
-            (true, false) if self.mirror => (f, f.map(|x| -x)),
-            _ => (f, b),
+        let seen = if direction == Direction::Forward { ahead } else { behind };
+        let turned = !seen && self.mirror;
+        let forward = (direction == Direction::Forward) != turned;
+        let (raw, channels, first) = match raw {
+            Raw::Passes(f, b) => (if forward { f } else { b }, 4, 0),
+            Raw::Single(s) => (s, 7, if forward { 0 } else { 3 }),
+        };
+        let factor = if forward { self.factor.0 } else { self.factor.1 };
+        for (v, raw) in out.iter_mut().zip(raw.chunks_exact(channels)) {
+            let x = [raw[first] * factor, raw[first + 1] * factor, raw[first + 2] * factor];
+            *v = match &self.rotation {
+                Some(r) => std::array::from_fn(|i| r[i][0] * x[0] + r[i][1] * x[1] + r[i][2] * x[2]),
+                None => x,
+            };
+            if turned {
+                *v = v.map(|x| -x);
+            }
         }
     }
 
     /// v+ of a row.
     pub(crate) fn forward_row(&self, raw: Raw, out: &mut [[f32; 3]]) {
-        out.iter_mut().enumerate().for_each(|(u, v)| *v = self.pixel(&raw, u).0);
+        self.velocity_row(raw, Direction::Forward, out);
     }
 
     /// v- of a row.
     pub(crate) fn backward_row(&self, raw: Raw, out: &mut [[f32; 3]]) {
-        out.iter_mut().enumerate().for_each(|(u, v)| *v = self.pixel(&raw, u).1);
+        self.velocity_row(raw, Direction::Backward, out);
     }
 
     /// Logits of a direction's dynamic probability; zeros where the direction is not read.
