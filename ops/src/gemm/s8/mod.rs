@@ -222,34 +222,34 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
     // Bytes of the next panels for each step of each tile.
     let per_step = part.panels * STEP / part.rows.div_ceil(mr);
     let next_panels = w.as_ptr().wrapping_add(part.panels * steps * STEP);
-    let mut done = 0;
-    if steps <= block
-        && let Sink::Values { .. } = p.sink
-    {
-        // Nothing to be continued: whole tiles in one call.
-        let full = part.rows - part.rows % mr;
-        ctx.kernels.product_tiles_s8(
-            p.few,
-            ProductS8 {
-                kernels: ctx.kernels,
-                panels: part.panels,
-                steps,
-                a: &packed[..full * steps * quad],
-                w,
-                start: &start,
-                finish: epilogue(p, Part { rows: full, ..part }, (&columns, &[])),
-                acc: &mut acc[..size],
-                next: next_panels,
-                per_step,
-            },
-        );
-        done = full;
-    }
     let mut s0 = 0;
     loop {
         let here = block.min(steps - s0);
         let next = next_panels.wrapping_add(s0 * part.panels * STEP);
         let last = s0 + here == steps;
+        let start = if s0 == 0 { Some(&start) } else { None };
+        let mut done = 0;
+        if last && let Sink::Values { .. } = p.sink {
+            // No block follows: whole tiles in one call.
+            done = part.rows - part.rows % mr;
+            ctx.kernels.product_tiles_s8(
+                p.few,
+                ProductS8 {
+                    kernels: ctx.kernels,
+                    panels: part.panels,
+                    steps: here,
+                    a: &packed[s0 * mr * quad..],
+                    a_stride: steps * mr * quad,
+                    w: &w[s0 * STEP..],
+                    w_stride: steps * STEP,
+                    start,
+                    finish: epilogue(p, Part { rows: done, ..part }, (&columns, &[])),
+                    acc: &mut *acc,
+                    next,
+                    per_step,
+                },
+            );
+        }
         for r in (done..part.rows).step_by(mr) {
             let (tile, rows) = (r / mr, mr.min(part.rows - r));
             let width = p.kernel.fit(rows);
@@ -266,7 +266,7 @@ fn block_of_panels(ctx: Ctx, p: &Product, part: Part, (packed, acc): (&[f32], &m
                 a: &packed[(r * steps + s0 * width) * quad..][..here * width * quad],
                 w: &w[s0 * STEP..],
                 w_stride: steps * STEP,
-                start: if s0 == 0 { Some(&start) } else { None },
+                start,
                 acc: &mut *acc,
                 acc_stride: mr * NR,
                 ahead,

@@ -1,5 +1,4 @@
-//! Full tiles below one another, each with its epilogue: a block of rows times a group of panels in one call, for products whose inputs
-//! fit one block of steps.
+//! Full tiles below one another, each with its epilogue: a block of rows times a group of panels in one call, in the last block of steps.
 //!
 //! A narrow layer's tile is some 400 cycles of dot products. Called tile by tile, with sums through memory and an epilogue of its own, it
 //! took as many again. Here the usual epilogues, `y` and `out + y`, take sums from the registers where they are; the others read one
@@ -19,17 +18,21 @@ pub(crate) struct ProductS8<'a> {
     pub kernels: &'static Kernels,
     /// Panels, up to the kernel's nr / 16.
     pub panels: usize,
-    /// Steps of four inputs.
+    /// Steps of four inputs, up to the last.
     pub steps: usize,
-    /// `[tile][step][row][4]`: the bytes of the kernel's values.
+    /// `[tile][step][row][4]`, from the first of these steps on: the bytes of the kernel's values.
     pub a: &'a [i8],
-    /// First panel.
+    /// Bytes from one tile to the next.
+    pub a_stride: usize,
+    /// First panel at its first step.
     pub w: &'a [i8],
-    /// Where every row's sums start, per panel.
-    pub start: &'a [[i32; LANES]; MAX_NV],
+    /// Bytes from one panel to the next.
+    pub w_stride: usize,
+    /// Where every row's sums start, per panel; none continues `acc`.
+    pub start: Option<&'a [[i32; LANES]; MAX_NV]>,
     /// The epilogue of all rows, of which there are whole tiles; its own `acc` is not looked at.
     pub finish: FinishS8<'a>,
-    /// Room for the sums of a tile, `[panel][row][16]`.
+    /// Sums of the steps before, `[tile][panel][row][16]`; room for one tile where there are none.
     pub acc: &'a mut [i32],
     /// Weights that are read after these.
     pub next: *const i8,
@@ -64,9 +67,9 @@ impl InRegisters {
 /// All tiles, of `MR` rows and `NV` panels.
 #[inline(always)]
 pub(crate) fn product<D: Dot8, S: Simd, const MR: usize, const NV: usize>(d: D, s: S, t: ProductS8) {
-    let ProductS8 { kernels, steps, a, w, start, finish, acc, next, per_step, .. } = t;
+    let ProductS8 { kernels, steps, a, a_stride, w, w_stride, start, finish, acc, next, per_step, .. } = t;
     let how = if D::PASSES == 1 { InRegisters::of(&finish) } else { InRegisters::No };
-    let row = steps * QUAD * size_of::<D::Elem>();
+    let (bytes, size) = (MR * steps * QUAD * size_of::<D::Elem>(), NV * MR * LANES);
     for first in (0..finish.row_scales.len()).step_by(MR) {
         let here = FinishS8 {
             row_scales: &finish.row_scales[first..first + MR],
@@ -75,14 +78,15 @@ pub(crate) fn product<D: Dot8, S: Simd, const MR: usize, const NV: usize>(d: D, 
             ..finish
         };
         let share = next.wrapping_add(first / MR * steps * per_step);
+        let acc = &mut acc[if start.is_some() { 0 } else { first / MR * size }..][..size];
         let mut tile = TileS8 {
             rows: MR,
             panels: NV,
             steps,
-            a: &a[first * row..][..MR * row],
+            a: &a[first / MR * a_stride..][..bytes],
             w,
-            w_stride: steps * super::pack::STEP,
-            start: Some(start),
+            w_stride,
+            start,
             acc: &mut *acc,
             acc_stride: MR * LANES,
             ahead: Ahead::nothing(a).with_weights(share, per_step).with_outputs(here.out.at(here.at), here.stride),
