@@ -67,9 +67,9 @@ def motion_losses(raw, velocity, depth, config):
     moving = (velocity.norm(dim=-1) > DYNAMIC).float()
     error = F.smooth_l1_loss(predicted, velocity, beta=1.0, reduction="none").sum(-1)
     still = (1 - moving) * (depth > 0)
-    value = (error * moving).sum() / moving.sum().clamp_min(200) + 0.25 * (error * still).sum() / still.sum().clamp_min(1)
+    value = (error * moving).sum() / moving.sum().clamp_min(200) + 0.35 * (error * still).sum() / still.sum().clamp_min(1)
     logit = raw[..., 3] + config["motion.bias"]
-    weight = 1 + 2 * moving
+    weight = 1 + moving
     mask = F.binary_cross_entropy_with_logits(logit, moving, weight, reduction="sum") / weight.sum()
     return value, mask
 
