@@ -6,7 +6,9 @@
 //! multiply-adds.
 //!
 //! Squared errors of parts add up, as long as each is measured alone. What an int8 network gains when one part becomes f16 is another
-//! thing: beside the part's own error it holds twice its product with all the others', which is larger and has any sign.
+//! thing: beside the part's own error it holds twice its product with all the others', which is larger and has any sign. So a candidate
+//! that brings the worst gate too little nearer for its work stays int8, and is asked again in the next of [`PASSES`]; in the last, anything
+//! is taken that helps.
 
 use crate::args::EngineArgs;
 use crate::model::{Scratch, scratch_folder};
@@ -29,6 +31,8 @@ use streetforward::Model;
 const MAX_SINGLE: usize = 120;
 /// Largest share of the multiply-adds that may be promoted.
 pub(crate) const BUDGET: f64 = 0.05;
+/// Times that the candidates are gone through.
+const PASSES: usize = 3;
 /// Share of a gate's bound from which on it counts.
 const PRESSED: f64 = 0.5;
 
@@ -101,22 +105,27 @@ impl<'a> Judge<'a> {
         candidates.sort_by(|a, b| (b.error / b.share).total_cmp(&(a.error / a.share)));
         let work = Work::of(&report.config);
         let mut promoted: Vec<String> = Vec::new();
-        for c in &candidates {
-            let mut more = promoted.clone();
-            more.extend(c.names.iter().filter(|n| !promoted.contains(n)).cloned());
-            if more.len() == promoted.len() || work.share(&more) > BUDGET {
-                continue;
-            }
-            promoted = more;
-            verdict = self.trial(&Options { promoted: promoted.clone(), ..options.clone() })?.0;
-            console.note(format!(
-                "{} as f16 ({:.2} % of the work): {:.3}",
-                c.label,
-                100.0 * work.share(&promoted),
-                versus::load(gates, &verdict)
-            ));
-            if versus::failures(gates, &verdict).is_empty() {
-                return Ok(promoted);
+        let mut least = versus::load(gates, &verdict);
+        for pass in 1..=PASSES {
+            for c in &candidates {
+                let mut more = promoted.clone();
+                more.extend(c.names.iter().filter(|n| !promoted.contains(n)).cloned());
+                if more.len() == promoted.len() || work.share(&more) > BUDGET {
+                    continue;
+                }
+                let tried = self.trial(&Options { promoted: more.clone(), ..options.clone() })?.0;
+                let load = versus::load(gates, &tried);
+                // What it must bring for its work so that the rest of the budget suffices; in the end, anything.
+                let (used, with) = (work.share(&promoted), work.share(&more));
+                let enough = if pass < PASSES { least.ln() / (BUDGET - used) } else { 0.0 };
+                if load >= least || (least / load).ln() < enough * (with - used) {
+                    continue;
+                }
+                (promoted, verdict, least) = (more, tried, load);
+                console.note(format!("{} as f16 ({:.2} % of the work): {load:.3}", c.label, 100.0 * with));
+                if versus::failures(gates, &verdict).is_empty() {
+                    return Ok(promoted);
+                }
             }
         }
         let share = work.share(&promoted);
