@@ -28,11 +28,12 @@ def step(name, *args):
 
 
 def made(path, name, *args):
-    """Makes `path` by a step unless it is there; the reason when it cannot be made."""
-    if Path(path).exists():
+    """Makes `path` by a step unless it is there and no older than its source, the step's first argument; the reason when it cannot be made."""
+    path, source = Path(path), Path(str(args[0]))
+    if path.exists() and not (source.is_file() and source.stat().st_mtime > path.stat().st_mtime):
         return None
     why = step(name, *args)
-    return why if why else None if Path(path).exists() else f"{name} wrote no file"
+    return why if why else None if path.exists() else f"{name} wrote no file"
 
 
 def onnx_network(checkpoint, frames, width, height, path):
