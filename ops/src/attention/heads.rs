@@ -145,7 +145,7 @@ pub(crate) fn prepare<S: Simd>(s: S, t: &HeadRows, n: usize, out: &mut [f32]) {
             for i in 0..n {
                 sum = sum + v[i];
             }
-            // Quotients and the root as numbers: with 16 lanes they take four times as long, six of them a third of a row's time.
+            // Quotients and the root as numbers: sixteen equal lanes take the divider four times as long.
             let mean = s.splat(fold_add(sum) / count);
             let mut squares = zero;
             for i in 0..n {
