@@ -7,11 +7,11 @@
 
 use crate::conv_map::{Shape, Step, TILES, sweep};
 use crate::cpu::{Ctx, Kernels};
+use crate::gemm::ahead::Ahead;
+use crate::gemm::finish::{Columns, Plus};
 use crate::gemm::pack::{Change, MAX_MR, RowPack};
-use crate::gemm::tile::{Finish, Tile};
-use crate::gemm::{
-    Act, AddTo, KC, MAX_NV, NR, PanelData, Panels, Product, RowSink, Rows, Sink, Source, per_column, product,
-};
+use crate::gemm::tile::Tile;
+use crate::gemm::{Act, Finished, KC, MAX_NV, NR, Out, Panels, Product, Rows, Sink, Source, finish_tile, product};
 use crate::mat::{Hwc, HwcMut};
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
@@ -96,7 +96,7 @@ pub fn working_memory_conv(x: (usize, usize, usize), kernel: usize, stride: usiz
 }
 
 /// Convolution whose windows overlap: bands of a padded map, windows in place.
-fn overlapping(ctx: Ctx, x: Hwc, conv: &Conv, sink: &RowSink) {
+fn overlapping(ctx: Ctx, x: Hwc, conv: &Conv, p: &Product) {
     let weight = conv.weight;
     let shape = shape((x.h, x.w, x.c), conv.kernel, conv.stride, conv.pad);
     if shape.oh * shape.ow * weight.n == 0 {
@@ -113,7 +113,7 @@ fn overlapping(ctx: Ctx, x: Hwc, conv: &Conv, sink: &RowSink) {
         ctx.pool.with_scratch(worker, scratch, |memory| {
             let (acc, map) = memory.split_at_mut(TILES * kernel.mr * kernel.nr);
             fill(ctx, x, &shape, conv.relu_input == Act::Relu, rows.start, &mut map[..shape.map(rows.len())]);
-            multiply(ctx, conv, &shape, rows, (map, acc), sink);
+            multiply(ctx, p, &shape, rows, (map, acc));
         });
     });
 }
@@ -138,54 +138,36 @@ fn fill(ctx: Ctx, x: Hwc, shape: &Shape, relu: bool, first: usize, map: &mut [f3
 }
 
 /// Every output of a band.
-fn multiply(
-    ctx: Ctx,
-    conv: &Conv,
-    shape: &Shape,
-    rows: std::ops::Range<usize>,
-    (map, acc): (&[f32], &mut [f32]),
-    sink: &RowSink,
-) {
-    let Panels { n, k, data } = conv.weight;
+fn multiply(ctx: Ctx, p: &Product, shape: &Shape, rows: std::ops::Range<usize>, (map, acc): (&[f32], &mut [f32])) {
+    let Panels { n, k, data } = p.w;
     let kernel = ctx.kernels.gemm(data.weights());
     let (mr, nv) = (kernel.mr, kernel.nr / NR);
     for panel in (0..n.div_ceil(NR)).step_by(nv) {
         let panels = nv.min(n.div_ceil(NR) - panel);
-        let bias = per_column(conv.bias, panel, n);
+        let columns = Columns::of(n, (panel, panels), p.bias, None);
+        let near = Ahead::nothing(map);
+        let ahead_of = |step: &Step| match (&p.out, step.done) {
+            (Out::Rows { out, stride, .. }, Some(row)) => near.with_outputs(out.at(row * stride + panel * NR), *stride),
+            _ => near,
+        };
         sweep(shape, rows.clone(), mr, KC, |step: Step| {
             let acc = &mut acc[step.tile * mr * kernel.nr..][..mr * NR * panels];
-            if step.start {
-                acc.fill(0.0);
-            }
-            let at = (panel * k + step.k) * NR;
             let tile = Tile {
                 rows: kernel.fit(step.pixels),
                 panels,
                 k: step.run,
                 a: &map[step.at..],
-                w: match data {
-                    PanelData::F32(d) => PanelData::F32(&d[at..]),
-                    PanelData::F16(d) => PanelData::F16(&d[at..]),
-                },
+                w: data.from((panel * k + step.k) * NR),
                 w_stride: k * NR,
+                start: step.start,
                 acc: &mut *acc,
                 acc_stride: mr * NR,
+                ahead: ahead_of(&step),
             };
             ctx.kernels.windows(tile, step.windows);
             if let Some(row) = step.done {
-                ctx.kernels.finish(Finish {
-                    acc: &mut *acc,
-                    acc_stride: mr * NR,
-                    rows: step.pixels,
-                    bias: conv.bias.map(|_| &bias[..]),
-                    act: conv.act,
-                    gamma: None,
-                    panels,
-                });
-                for v in 0..panels {
-                    let col = (panel + v) * NR;
-                    sink.put(row, col, NR.min(n - col), &acc[v * mr * NR..][..step.pixels * NR]);
-                }
+                let to = Finished { row, rows: step.pixels, panel, panels };
+                finish_tile(ctx.kernels, p, to, (&columns, acc, mr * NR));
             }
         });
     }
@@ -241,15 +223,19 @@ pub fn conv2d(ctx: Ctx, x: Hwc, conv: &Conv, residual: Option<Hwc>, out: HwcMut)
     if let Some(r) = residual {
         assert_eq!((r.h, r.w, r.c), (oh, ow, weight.n), "residual of a convolution");
     }
-    let add = residual.map_or(AddTo::Nothing, |r| AddTo::Other(r.as_mat()));
-    let sink = RowSink { out: SharedMut::new(out.data), stride: weight.n, add };
+    let plus = residual.map_or(Plus::Nothing, |r| Plus::Other(r.data));
     let _span = opclock::span(Op::Conv, || Work::product(oh * ow, &weight, x.h * x.w * x.c));
-    if kernel > stride {
-        return overlapping(ctx, x, conv, &sink);
-    }
     let source = Windows { x, ow, kernel, stride, pad, relu: conv.relu_input == Act::Relu };
-    let (bias, act) = (conv.bias, conv.act);
-    product(ctx, &Product { m: oh * ow, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
+    let p = Product {
+        m: oh * ow,
+        source: &source,
+        w: weight,
+        bias: conv.bias,
+        act: conv.act,
+        gamma: None,
+        out: Out::Rows { out: SharedMut::new(out.data), stride: weight.n, plus },
+    };
+    if kernel > stride { overlapping(ctx, x, conv, &p) } else { product(ctx, &p) }
 }
 
 /// Outputs `[ky][kx][out]` of input pixel (y, x) go to pixels (y k + ky, x k + kx).
@@ -294,5 +280,5 @@ pub fn conv_transpose(ctx: Ctx, x: Hwc, conv: &ConvTranspose, out: HwcMut) {
     let source = Rows(x.as_mat());
     let _span = opclock::span(Op::Conv, || Work::product(m, &weight, m * x.c));
     let sink = Scatter { w: x.w, kernel, line: kernel * out.c, out: SharedMut::new(out.data) };
-    product(ctx, &Product { m, source: &source, w: weight, bias, act, gamma: None, sink: &sink });
+    product(ctx, &Product { m, source: &source, w: weight, bias, act, gamma: None, out: Out::Sink(&sink) });
 }

@@ -18,9 +18,10 @@
 use crate::conv::conv_out;
 use crate::conv_map::{Shape, Step, TILES, sweep};
 use crate::cpu::Ctx;
+use crate::gemm::ahead::Ahead;
+use crate::gemm::finish::Plus;
 use crate::gemm::pack::{MAX_MR, NR};
-use crate::gemm::s8::ahead::Ahead;
-use crate::gemm::s8::finish::{ColumnsS8, FinishS8, Plus};
+use crate::gemm::s8::finish::{ColumnsS8, FinishS8};
 use crate::gemm::s8::pack::{PanelsS8, QUAD, STEP, padded_k};
 use crate::gemm::s8::table::GemmS8Kernel;
 use crate::gemm::s8::tile::{MAX_NV, TileS8};

@@ -36,8 +36,8 @@ use super::heads::{
 use super::integers::{Place, Watch};
 use super::softmax::{MergeS8, Rows, WEIGHT_ZERO, WeightsS8};
 use crate::cpu::{Ctx, Kernels};
+use crate::gemm::ahead::Ahead;
 use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
-use crate::gemm::s8::ahead::Ahead;
 use crate::gemm::s8::pack::{QUAD, STEP};
 use crate::gemm::s8::table::Activations;
 use crate::gemm::s8::tile::{ColumnS8, MAX_NV, TileS8};
@@ -442,7 +442,6 @@ impl<'a> Job<'a> {
     fn shifts(&self, unit: &Unit, q: &[f32], shift: &mut [[f32; LANES]]) {
         let nv = self.kernels.gemm_f32.nr / NR;
         for (p, shift) in (0..).step_by(nv).zip(shift.chunks_mut(nv)) {
-            shift.fill([0.0; LANES]);
             self.kernels.tile(Tile {
                 rows: 1,
                 panels: shift.len(),
@@ -450,8 +449,10 @@ impl<'a> Job<'a> {
                 a: &unit.mean[..self.d],
                 w: PanelData::F32(&q[p * NR * self.d..]),
                 w_stride: NR * self.d,
+                start: true,
                 acc: shift.as_flattened_mut(),
                 acc_stride: NR,
+                ahead: Ahead::nothing(unit.mean),
             });
         }
     }

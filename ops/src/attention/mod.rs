@@ -9,6 +9,7 @@ pub use int8::{Heads, attention_s8, scratch_len_s8};
 pub use integers::{QueryIntegers, attention_s8_integers};
 
 use crate::cpu::{Ctx, Kernels};
+use crate::gemm::ahead::Ahead;
 use crate::gemm::pack::{Change, MAX_MR, RowPack, strided};
 use crate::gemm::tile::Tile;
 use crate::gemm::{NR, PanelData};
@@ -141,11 +142,6 @@ impl Job<'_> {
             let (k, v) = (&k[unit * room.k..][..room.k], &v[unit * room.v..][..room.v]);
             for t in (0..tokens).step_by(KEYS) {
                 let keys = KEYS.min(tokens - t);
-                // What the tiles of these keys write, and no more.
-                for p in 0..QUERIES / NR {
-                    let rows = keys.next_multiple_of(kernel.mr);
-                    scores[p * score_rows * NR..][..rows * NR].fill(0.0);
-                }
                 for p in (0..QUERIES / NR).step_by(nv) {
                     for r in (0..keys).step_by(kernel.mr) {
                         let rows = kernel.fit(kernel.mr.min(keys - r));
@@ -156,8 +152,10 @@ impl Job<'_> {
                             a: &k[(t + r) * d..][..rows * d],
                             w: PanelData::F32(&q[p * NR * d..]),
                             w_stride: NR * d,
+                            start: true,
                             acc: &mut scores[(p * score_rows + r) * NR..],
                             acc_stride: score_rows * NR,
+                            ahead: Ahead::nothing(k),
                         });
                     }
                 }
@@ -179,8 +177,10 @@ impl Job<'_> {
                             a: &v[r * tokens + t * rows..][..keys * rows],
                             w: PanelData::F32(&scores[p * score_rows * NR..]),
                             w_stride: score_rows * NR,
+                            start: false,
                             acc: &mut sums[(p * room.d + r) * NR..],
                             acc_stride: room.d * NR,
+                            ahead: Ahead::nothing(v),
                         });
                     }
                 }

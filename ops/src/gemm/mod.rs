@@ -1,5 +1,7 @@
 //! out = epilogue(A W^T): f32 activations, f32 or f16 weights in K1N16 panels. The int8 family is in `s8/`.
 
+pub(crate) mod ahead;
+pub(crate) mod finish;
 pub mod pack;
 pub mod s8;
 pub mod table;
@@ -9,8 +11,9 @@ use crate::cpu::{Ctx, Kernels};
 use crate::mat::{Mat, MatMut};
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
+use finish::{Columns, Finish, Plus};
 use pack::{Change, MAX_MR, RowPack, strided};
-use tile::{Finish, Tile};
+use tile::Tile;
 
 pub use pack::{NR, PanelData, Panels, pack_f16, pack_f32, panel_len, unpack};
 pub use s8::pack::{PanelsS8, RowsS8, RowsS8Mut, col_sums, pack_s8, padded_k, panel_len_s8, unpack_s8};
@@ -50,11 +53,19 @@ pub(crate) trait Source: Sync {
     fn pack(&self, kernels: &Kernels, first: usize, rows: usize, width: usize, out: &mut [f32]);
 }
 
-/// Where finished outputs go.
+/// Where finished outputs go that are no rows of a matrix.
 pub(crate) trait Sink: Sync {
     /// Takes `values[r * 16..][..cols]` as row `row + r`, columns `col..col + cols`, for every whole 16 in `values`.
     /// Called once for each output.
     fn put(&self, row: usize, col: usize, cols: usize, values: &[f32]);
+}
+
+/// Where finished outputs go.
+pub(crate) enum Out<'a> {
+    /// Rows of a matrix, so many values apart, on top of something or not.
+    Rows { out: SharedMut<'a, f32>, stride: usize, plus: Plus<'a> },
+    /// Through a sink, panel by panel.
+    Sink(&'a dyn Sink),
 }
 
 /// Rows of a matrix.
@@ -65,55 +76,6 @@ impl Source for Rows<'_> {
         let Mat { data, cols, stride, .. } = self.0;
         let x = &data[(first * stride).min(data.len())..];
         kernels.pack(RowPack { from: strided(x, stride, rows), k: cols, width, change: Change::Keep, out });
-    }
-}
-
-/// What is added to an output when it is stored.
-#[derive(Clone, Copy)]
-pub(crate) enum AddTo<'a> {
-    Nothing,
-    /// What the output holds.
-    Output,
-    /// The same element of another matrix.
-    Other(Mat<'a>),
-}
-
-/// Row-major output.
-pub(crate) struct RowSink<'a> {
-    pub out: SharedMut<'a, f32>,
-    pub stride: usize,
-    pub add: AddTo<'a>,
-}
-
-impl Sink for RowSink<'_> {
-    fn put(&self, row: usize, col: usize, cols: usize, values: &[f32]) {
-        for (r, y) in values.as_chunks::<NR>().0.iter().enumerate() {
-            let at = (row + r) * self.stride + col;
-            // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
-            #[allow(unsafe_code)]
-            let out = unsafe { self.out.slice(at..at + cols) };
-            let other = match self.add {
-                AddTo::Other(x) => &x.row(row + r)[col..][..cols],
-                _ => &[],
-            };
-            match (self.add, out.as_chunks_mut::<NR>().0, other.as_chunks::<NR>().0) {
-                // Whole vectors of 16: the compiler keeps them in registers.
-                (AddTo::Nothing, [out], _) => *out = *y,
-                (AddTo::Output, [out], _) => (0..NR).for_each(|i| out[i] += y[i]),
-                (AddTo::Other(_), [out], [x]) => (0..NR).for_each(|i| out[i] = x[i] + y[i]),
-                _ => put_narrow(self.add, y, other, out),
-            }
-        }
-    }
-}
-
-/// Less than sixteen columns. Apart, or the compiler merges its copy with that of whole vectors into a call of the C library.
-#[inline(never)]
-fn put_narrow(add: AddTo, y: &[f32; NR], other: &[f32], out: &mut [f32]) {
-    match add {
-        AddTo::Nothing => out.copy_from_slice(&y[..out.len()]),
-        AddTo::Output => out.iter_mut().zip(y).for_each(|(o, y)| *o += y),
-        AddTo::Other(_) => out.iter_mut().zip(other).zip(y).for_each(|((o, x), y)| *o = x + y),
     }
 }
 
@@ -132,7 +94,7 @@ pub(crate) struct Product<'a> {
     /// `[n]`.
     pub gamma: Option<&'a [f32]>,
     /// Outputs.
-    pub sink: &'a dyn Sink,
+    pub out: Out<'a>,
 }
 
 /// Packed activations of one task: at most 256 KiB, a quarter of a usual second-level cache, so that the panels
@@ -191,7 +153,7 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
             let mut panel = from;
             while panel < to {
                 let here = nv.min(to - panel);
-                columns(ctx.kernels, p, Columns { first, rows, panel, panels: here }, packed, acc);
+                block_of_panels(ctx.kernels, p, Part { first, rows, panel, panels: here }, packed, acc);
                 panel += here;
             }
         });
@@ -199,41 +161,34 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
 }
 
 /// One group of panels over the rows of a task.
-struct Columns {
+struct Part {
     first: usize,
     rows: usize,
     panel: usize,
     panels: usize,
 }
 
-/// Values of the columns of a group of panels, zeros beyond n; they repeat with their length as period.
-pub(crate) fn per_column(values: Option<&[f32]>, panel: usize, n: usize) -> [[f32; NR]; MAX_NV] {
-    let mut lanes = [[0.0f32; NR]; MAX_NV];
-    if let Some(values) = values {
-        for (i, lane) in lanes.as_flattened_mut().iter_mut().enumerate() {
-            if panel * NR + i < n {
-                *lane = values[(panel * NR + i) % values.len()];
-            }
-        }
-    }
-    lanes
-}
-
-fn columns(kernels: &Kernels, p: &Product, c: Columns, packed: &[f32], acc: &mut [f32]) {
+fn block_of_panels(kernels: &Kernels, p: &Product, c: Part, packed: &[f32], acc: &mut [f32]) {
     let kernel = kernels.gemm(p.w.data.weights());
-    let (n, k, mr) = (p.w.n, p.w.k, kernel.mr);
-    let stride = c.rows.next_multiple_of(mr) * NR;
-    let acc = &mut acc[..c.panels * stride];
-    acc.fill(0.0);
-    for k0 in (0..k).step_by(KC) {
+    let (k, mr) = (p.w.k, kernel.mr);
+    let size = mr * NR * c.panels;
+    let columns = Columns::of(p.w.n, (c.panel, c.panels), p.bias, p.gamma);
+    // Values of the next panels for each step of each tile.
+    let per_step = c.panels * NR / c.rows.div_ceil(mr);
+    let mut k0 = 0;
+    loop {
         let steps = KC.min(k - k0);
-        let at = (c.panel * k + k0) * NR;
-        let w = match p.w.data {
-            PanelData::F32(d) => PanelData::F32(&d[at..]),
-            PanelData::F16(d) => PanelData::F16(&d[at..]),
-        };
+        let last = k0 + steps == k;
+        let w = p.w.data.from((c.panel * k + k0) * NR);
         for r in (0..c.rows).step_by(mr) {
-            let rows = kernel.fit(mr.min(c.rows - r));
+            let (tile, here) = (r / mr, mr.min(c.rows - r));
+            let rows = kernel.fit(here);
+            let acc = &mut acc[tile * size..][..size];
+            let next = ((c.panel + c.panels) * k + k0 * c.panels) * NR + tile * steps * per_step;
+            let mut ahead = p.w.data.ahead(next, per_step);
+            if last && let Out::Rows { out, stride, .. } = &p.out {
+                ahead = ahead.with_outputs(out.at((c.first + r) * stride + c.panel * NR), *stride);
+            }
             kernels.tile(Tile {
                 rows,
                 panels: c.panels,
@@ -241,25 +196,79 @@ fn columns(kernels: &Kernels, p: &Product, c: Columns, packed: &[f32], acc: &mut
                 a: &packed[r * k + k0 * rows..][..steps * rows],
                 w,
                 w_stride: k * NR,
-                acc: &mut acc[r * NR..],
-                acc_stride: stride,
+                start: k0 == 0,
+                acc: &mut *acc,
+                acc_stride: mr * NR,
+                ahead,
             });
+            if last {
+                let to = Finished { row: c.first + r, rows: here, panel: c.panel, panels: c.panels };
+                finish_tile(kernels, p, to, (&columns, acc, mr * NR));
+            }
         }
+        if last {
+            return;
+        }
+        k0 += steps;
     }
-    let bias = per_column(p.bias, c.panel, n);
-    let gamma = per_column(p.gamma, c.panel, n);
-    kernels.finish(Finish {
-        acc: &mut *acc,
-        acc_stride: stride,
-        rows: c.rows,
-        bias: p.bias.map(|_| &bias[..]),
-        act: p.act,
-        gamma: p.gamma.map(|_| &gamma[..]),
-        panels: c.panels,
-    });
-    for v in 0..c.panels {
-        let col = (c.panel + v) * NR;
-        p.sink.put(c.first, col, NR.min(n - col), &acc[v * stride..][..c.rows * NR]);
+}
+
+/// Which outputs a tile holds.
+pub(crate) struct Finished {
+    pub row: usize,
+    pub rows: usize,
+    pub panel: usize,
+    pub panels: usize,
+}
+
+/// Sums of one tile, `acc` `[panel][acc_stride]`, to the output.
+pub(crate) fn finish_tile(
+    kernels: &Kernels,
+    p: &Product,
+    t: Finished,
+    (columns, acc, acc_stride): (&Columns, &[f32], usize),
+) {
+    let (n, col) = (p.w.n, t.panel * NR);
+    let (bias, gamma) = (p.bias.is_some(), p.gamma.is_some());
+    match &p.out {
+        Out::Rows { out, stride, plus } => kernels.finish(Finish {
+            acc,
+            acc_stride,
+            panels: t.panels,
+            rows: t.rows,
+            columns,
+            bias,
+            act: p.act,
+            gamma,
+            plus: *plus,
+            out,
+            at: t.row * stride + col,
+            stride: *stride,
+            cols: (t.panels * NR).min(n - col),
+        }),
+        Out::Sink(sink) => {
+            for panel in 0..t.panels {
+                let mut values = [0.0; MAX_MR * NR];
+                let values = &mut values[..t.rows * NR];
+                kernels.finish(Finish {
+                    acc: &acc[panel * acc_stride..],
+                    acc_stride,
+                    panels: 1,
+                    rows: t.rows,
+                    columns: &columns.panel(panel),
+                    bias,
+                    act: p.act,
+                    gamma,
+                    plus: Plus::Nothing,
+                    out: &SharedMut::new(values),
+                    at: 0,
+                    stride: NR,
+                    cols: NR,
+                });
+                let col = col + panel * NR;
+                sink.put(t.row, col, NR.min(n - col), values);
+            }
+        }
     }
 }
 
@@ -274,10 +283,9 @@ pub fn gemm(ctx: Ctx, a: Mat, w: Panels, ep: Epilogue, out: MatMut) {
     for (what, v) in [("bias", ep.bias), ("gamma", ep.gamma)] {
         assert!(v.is_none_or(|v| v.len() == w.n), "{what} of {} outputs", w.n);
     }
-    let add = if ep.residual { AddTo::Output } else { AddTo::Nothing };
-    let stride = out.stride;
-    let sink = RowSink { out: SharedMut::new(out.data), stride, add };
+    let plus = if ep.residual { Plus::Output } else { Plus::Nothing };
+    let out = Out::Rows { stride: out.stride, out: SharedMut::new(out.data), plus };
     let source = Rows(a);
     let _span = opclock::span(Op::Gemm, || Work::product(a.rows, &w, a.rows * a.cols));
-    product(ctx, &Product { m: a.rows, source: &source, w, bias: ep.bias, act: ep.act, gamma: ep.gamma, sink: &sink });
+    product(ctx, &Product { m: a.rows, source: &source, w, bias: ep.bias, act: ep.act, gamma: ep.gamma, out });
 }

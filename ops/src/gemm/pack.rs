@@ -4,6 +4,7 @@
 //! output: element (n, k) lies at `(n / 16 * K + k) * 16 + n % 16`. Outputs beyond n are zeros. With f32 one
 //! step of k is one cache line; with f16 (IEEE half bits, round to nearest even) half a line.
 
+use super::ahead::Ahead;
 use crate::activation::relu_lanes;
 use crate::simd::{LANES, Simd, Vector};
 
@@ -17,6 +18,24 @@ pub enum PanelData<'a> {
     F32(&'a [f32]),
     /// IEEE half precision, as bits.
     F16(&'a [u16]),
+}
+
+impl<'a> PanelData<'a> {
+    /// The values from one on.
+    pub(crate) fn from(self, at: usize) -> PanelData<'a> {
+        match self {
+            PanelData::F32(d) => PanelData::F32(&d[at..]),
+            PanelData::F16(d) => PanelData::F16(&d[at..]),
+        }
+    }
+
+    /// Asks for the values from one on (it may lie behind the last), so many for each step.
+    pub(crate) fn ahead(self, at: usize, per_step: usize) -> Ahead {
+        match self {
+            PanelData::F32(d) => Ahead::nothing(d).with_weights(d.as_ptr().wrapping_add(at), per_step),
+            PanelData::F16(d) => Ahead::nothing(d).with_weights(d.as_ptr().wrapping_add(at), per_step),
+        }
+    }
 }
 
 /// A borrowed `[n, k]` weight matrix in panels.

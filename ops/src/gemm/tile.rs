@@ -4,8 +4,9 @@
 //! side by side), or as windows of a map, read in place. Sums live in memory as `[panel][row][16]` between calls, so blocking over k continues them and the
 //! bits never depend on the blocking. Written once; every instruction set instantiates it.
 
-use super::{Act, PanelData, WeightType};
-use crate::activation::{gelu_lanes, relu_lanes};
+use super::ahead::{Ahead, EARLY};
+use super::{PanelData, WeightType};
+use crate::prefetch::near_l1;
 use crate::simd::{LANES, Simd, Vector};
 
 /// Where the windows of a tile lie in a map, in values.
@@ -33,10 +34,14 @@ pub(crate) struct Tile<'a> {
     pub w: PanelData<'a>,
     /// Values from one panel to the next.
     pub w_stride: usize,
+    /// Whether sums start at zero; else at `acc`.
+    pub start: bool,
     /// Row 0 of panel 0.
     pub acc: &'a mut [f32],
     /// Values from one panel's sums to the next.
     pub acc_stride: usize,
+    /// What is asked for meanwhile.
+    pub ahead: Ahead,
 }
 
 impl PanelData<'_> {
@@ -67,10 +72,13 @@ impl Weight for u16 {
     }
 }
 
-/// Sums of a tile in registers, from where the last block left them.
+/// Sums of a tile in registers, from zero or from where the last block left them.
 #[inline(always)]
 fn begin<S: Simd, const MR: usize, const NV: usize>(s: S, t: &Tile) -> [[S::V; NV]; MR] {
     let mut acc = [[s.splat(0.0); NV]; MR];
+    if t.start {
+        return acc;
+    }
     for v in 0..NV {
         let sums = &t.acc[v * t.acc_stride..][..MR * LANES].as_chunks::<LANES>().0[..MR];
         for r in 0..MR {
@@ -101,18 +109,30 @@ pub(crate) fn packed<S: Simd, W: Weight, const MR: usize, const NV: usize>(s: S,
         panels[v] = &w[v * t.w_stride..][..k * LANES].as_chunks::<LANES>().0[..k];
     }
     let mut acc = begin::<S, MR, NV>(s, &t);
-    for i in 0..k {
-        let mut wv = [s.splat(0.0); NV];
-        for v in 0..NV {
-            wv[v] = W::load(s, &panels[v][i]);
-        }
-        let row = &a[i];
-        for r in 0..MR {
-            let x = s.splat(row[r]);
+    let mut asking = t.ahead.over::<NV>(MR, k);
+    let mut done = 0;
+    while done < k {
+        let here = asking.next(S::AHEAD, done);
+        for i in done..done + here {
+            if S::AHEAD {
+                near_l1(a.as_ptr().wrapping_add(i + EARLY));
+                for v in 0..NV {
+                    near_l1(panels[v].as_ptr().wrapping_add(i + EARLY));
+                }
+            }
+            let mut wv = [s.splat(0.0); NV];
             for v in 0..NV {
-                acc[r][v] = x.mul_add(wv[v], acc[r][v]);
+                wv[v] = W::load(s, &panels[v][i]);
+            }
+            let row = &a[i];
+            for r in 0..MR {
+                let x = s.splat(row[r]);
+                for v in 0..NV {
+                    acc[r][v] = x.mul_add(wv[v], acc[r][v]);
+                }
             }
         }
+        done += here;
     }
     end(acc, t);
 }
@@ -132,17 +152,29 @@ pub(crate) fn windows<S: Simd, W: Weight, const MR: usize, const NV: usize>(s: S
         for v in 0..NV {
             panels[v] = &w[v * t.w_stride + l * run * LANES..][..run * LANES].as_chunks::<LANES>().0[..run];
         }
-        for i in 0..run {
-            let mut wv = [s.splat(0.0); NV];
-            for v in 0..NV {
-                wv[v] = W::load(s, &panels[v][i]);
-            }
-            for r in 0..MR {
-                let x = s.splat(rows[r][i]);
+        // The outputs while the last line runs.
+        let mut asking = t.ahead.over::<NV>(MR, run);
+        let mut done = 0;
+        while done < run {
+            let here = asking.next(S::AHEAD && l + 1 == lines, done);
+            for i in done..done + here {
+                if S::AHEAD {
+                    for v in 0..NV {
+                        near_l1(panels[v].as_ptr().wrapping_add(i + EARLY));
+                    }
+                }
+                let mut wv = [s.splat(0.0); NV];
                 for v in 0..NV {
-                    acc[r][v] = x.mul_add(wv[v], acc[r][v]);
+                    wv[v] = W::load(s, &panels[v][i]);
+                }
+                for r in 0..MR {
+                    let x = s.splat(rows[r][i]);
+                    for v in 0..NV {
+                        acc[r][v] = x.mul_add(wv[v], acc[r][v]);
+                    }
                 }
             }
+            done += here;
         }
     }
     end(acc, t);
@@ -193,54 +225,3 @@ macro_rules! call {
     };
 }
 pub(crate) use call;
-
-/// The epilogue of a finished tile, in place on its sums.
-pub(crate) struct Finish<'a> {
-    /// `[panel][row][16]`.
-    pub acc: &'a mut [f32],
-    /// Values from one panel's sums to the next.
-    pub acc_stride: usize,
-    /// Rows in use.
-    pub rows: usize,
-    /// Per panel, zeros beyond n.
-    pub bias: Option<&'a [[f32; LANES]]>,
-    /// Activation.
-    pub act: Act,
-    /// Per panel.
-    pub gamma: Option<&'a [[f32; LANES]]>,
-    /// Panels in use.
-    pub panels: usize,
-}
-
-/// y = act(acc + bias) * gamma; every step rounds once.
-#[inline(always)]
-pub(crate) fn finish<S: Simd>(s: S, t: Finish) {
-    for p in 0..t.panels {
-        let rows = &mut t.acc[p * t.acc_stride..][..t.rows * LANES].as_chunks_mut::<LANES>().0[..t.rows];
-        if let Some(bias) = t.bias {
-            let b = s.load(&bias[p]);
-            for row in rows.iter_mut() {
-                (s.load(row) + b).store(row);
-            }
-        }
-        match t.act {
-            Act::None => {}
-            Act::Gelu => {
-                for row in rows.iter_mut() {
-                    gelu_lanes(s, s.load(row)).store(row);
-                }
-            }
-            Act::Relu => {
-                for row in rows.iter_mut() {
-                    relu_lanes(s, s.load(row)).store(row);
-                }
-            }
-        }
-        if let Some(gamma) = t.gamma {
-            let g = s.load(&gamma[p]);
-            for row in rows.iter_mut() {
-                (s.load(row) * g).store(row);
-            }
-        }
-    }
-}

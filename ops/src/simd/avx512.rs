@@ -30,6 +30,7 @@ impl Avx512 {
 impl Simd for Avx512 {
     type V = V;
     const REGISTERS: usize = 32;
+    const AHEAD: bool = true;
 
     #[inline(always)]
     fn splat(self, x: f32) -> V {

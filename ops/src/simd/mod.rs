@@ -32,6 +32,8 @@ pub trait Simd: Copy {
     type V: Vector;
     /// How many vectors the registers hold.
     const REGISTERS: usize;
+    /// Whether tiles ask for memory ahead of its use; pays where multiply-adds outrun the caches.
+    const AHEAD: bool = false;
     /// Every lane `x`.
     fn splat(self, x: f32) -> Self::V;
     /// Lane i from `x[i]`.

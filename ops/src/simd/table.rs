@@ -9,10 +9,10 @@ use crate::activation::Map;
 use crate::attention::heads::{KeyPack, QueryPack, ValuePack};
 use crate::attention::softmax::{MergeS8, Rows, SoftmaxTile, WeightsS8};
 use crate::cpu::{Features, Kernels};
+use crate::gemm::finish::Finish;
 use crate::gemm::pack::RowPack;
 use crate::gemm::s8::finish::FinishS8;
 use crate::gemm::s8::rows::{QuadPack, WidePack};
-use crate::gemm::tile::Finish;
 use crate::layernorm::NormRow;
 use crate::peak::Width;
 use crate::quantize::{QuantizeRow, ToMap};
@@ -48,7 +48,7 @@ pub struct VectorKernels {
     pub(crate) pack_queries: unsafe fn(QueryPack),
     /// `attention::heads::pack_values`.
     pub(crate) pack_values: unsafe fn(ValuePack),
-    /// `gemm::tile::finish`.
+    /// `gemm::finish::finish`.
     pub(crate) finish: unsafe fn(Finish),
     /// `gemm::pack::pack_rows`.
     pub(crate) pack: unsafe fn(RowPack),
@@ -132,8 +132,8 @@ macro_rules! vector_kernels {
                 crate::attention::heads::pack_values($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
-            fn finish(tile: crate::gemm::tile::Finish) {
-                crate::gemm::tile::finish($token::new(), tile);
+            fn finish(tile: crate::gemm::finish::Finish) {
+                crate::gemm::finish::finish($token::new(), tile);
             }
             $(#[target_feature(enable = $features)])?
             fn pack(rows: crate::gemm::pack::RowPack) {

@@ -2,20 +2,11 @@
 
 use super::pack::PanelsS8;
 use super::tile::MAX_NV;
-use crate::activation::{Gelu, Relu, gelu_lanes, relu_lanes};
+use crate::activation::{Gelu, Relu};
 use crate::gemm::Act;
+use crate::gemm::finish::{Columns, Last, Plus, Same, sixteen};
 use crate::par::SharedMut;
-use crate::simd::{LANES, Lanewise, Simd, Vector, padded};
-
-/// What is added to an output when it is stored.
-#[derive(Clone, Copy)]
-pub(crate) enum Plus<'a> {
-    Nothing,
-    /// What the output holds.
-    Output,
-    /// The value at the same place of another matrix of the output's shape.
-    Other(&'a [f32]),
-}
+use crate::simd::{LANES, Lanewise, Simd, Vector};
 
 /// The epilogue of one tile of sums.
 #[derive(Clone, Copy)]
@@ -52,8 +43,7 @@ pub(crate) struct FinishS8<'a> {
 #[derive(Clone, Copy, Default)]
 pub(crate) struct ColumnsS8 {
     pub scales: [[f32; LANES]; MAX_NV],
-    pub bias: [[f32; LANES]; MAX_NV],
-    pub gamma: [[f32; LANES]; MAX_NV],
+    pub rest: Columns,
 }
 
 impl ColumnsS8 {
@@ -64,41 +54,20 @@ impl ColumnsS8 {
         bias: Option<&[f32]>,
         gamma: Option<&[f32]>,
     ) -> ColumnsS8 {
-        let mut columns = ColumnsS8::default();
+        let rest = Columns::of(w.n, (panel, panels), bias, gamma);
+        let mut columns = ColumnsS8 { scales: [[0.0; LANES]; MAX_NV], rest };
         for v in 0..panels {
             let col = (panel + v) * LANES;
-            let cols = LANES.min(w.n - col);
-            columns.scales[v] = sixteen(&w.scales[col..], cols);
-            if let Some(bias) = bias {
-                match bias.get(col..col + cols) {
-                    Some(bias) => columns.bias[v] = sixteen(bias, cols),
-                    None => {
-                        for (i, b) in columns.bias[v][..cols].iter_mut().enumerate() {
-                            *b = bias[(col + i) % bias.len()];
-                        }
-                    }
-                }
-            }
-            if let Some(gamma) = gamma {
-                columns.gamma[v] = sixteen(&gamma[col..], cols);
-            }
+            columns.scales[v] = sixteen(&w.scales[col..], LANES.min(w.n - col));
         }
         columns
     }
 
     /// Panel `p` alone.
     pub(crate) fn panel(&self, p: usize) -> ColumnsS8 {
-        let mut columns = ColumnsS8::default();
-        (columns.scales[0], columns.bias[0], columns.gamma[0]) = (self.scales[p], self.bias[p], self.gamma[p]);
+        let mut columns = ColumnsS8 { rest: self.rest.panel(p), ..ColumnsS8::default() };
+        columns.scales[0] = self.scales[p];
         columns
-    }
-}
-
-/// The first `cols` values, zeros behind them. Sixteen as one copy of known size: of unknown size it is a call of the C library.
-fn sixteen(x: &[f32], cols: usize) -> [f32; LANES] {
-    match x.first_chunk::<LANES>() {
-        Some(x) if cols == LANES => *x,
-        _ => padded(&x[..cols], 0.0),
     }
 }
 
@@ -118,16 +87,6 @@ pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
     }
 }
 
-/// No activation.
-struct Same;
-
-impl Lanewise for Same {
-    #[inline(always)]
-    fn apply<S: Simd>(_: S, x: S::V) -> S::V {
-        x
-    }
-}
-
 /// Whole panels, activation `F`, nothing added.
 #[inline(always)]
 fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &FinishS8) {
@@ -138,7 +97,7 @@ fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &FinishS8) {
     for v in 0..NV {
         acc[v] = &t.acc[v * t.acc_stride..].as_chunks::<LANES>().0[..rows];
         scale[v] = s.load(&t.columns.scales[v]);
-        bias[v] = s.load(&t.columns.bias[v]);
+        bias[v] = s.load(&t.columns.rest.bias[v]);
     }
     for r in 0..rows {
         let at = t.at + r * t.stride;
@@ -160,51 +119,17 @@ fn finish_any<S: Simd>(s: S, t: &FinishS8) {
     for p in 0..t.panels {
         let acc = &t.acc[p * t.acc_stride..][..rows * LANES].as_chunks::<LANES>().0[..rows];
         let scale = s.load(&t.columns.scales[p]);
-        let bias = s.load(&t.columns.bias[p]);
-        let gamma = s.load(&t.columns.gamma[p]);
-        let cols = LANES.min(t.cols - p * LANES);
+        let bias = s.load(&t.columns.rest.bias[p]);
+        let last = Last {
+            act: t.act,
+            gamma: t.gamma.then(|| s.load(&t.columns.rest.gamma[p])),
+            plus: t.plus,
+            relu_sum: t.relu_sum,
+            cols: LANES.min(t.cols - p * LANES),
+        };
         for r in 0..rows {
-            let mut y = s.load_i32(&acc[r]).mul_add(s.splat(t.row_scales[r]) * scale, bias);
-            match t.act {
-                Act::None => {}
-                Act::Gelu => y = gelu_lanes(s, y),
-                Act::Relu => y = relu_lanes(s, y),
-            }
-            if t.gamma {
-                y = y * gamma;
-            }
-            let at = t.at + r * t.stride + p * LANES;
-            // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
-            #[allow(unsafe_code)]
-            let out = unsafe { t.out.slice(at..at + cols) };
-            let mut lanes = [0.0; LANES];
-            match t.plus {
-                Plus::Nothing => {}
-                Plus::Output => y = load_some(s, out, &mut lanes) + y,
-                Plus::Other(x) => y = load_some(s, &x[at..at + cols], &mut lanes) + y,
-            }
-            if t.relu_sum {
-                y = relu_lanes(s, y);
-            }
-            match out.first_chunk_mut::<LANES>() {
-                Some(out) => y.store(out),
-                None => {
-                    y.store(&mut lanes);
-                    out.copy_from_slice(&lanes[..out.len()]);
-                }
-            }
-        }
-    }
-}
-
-/// Up to sixteen values, zeros beyond.
-#[inline(always)]
-fn load_some<S: Simd>(s: S, x: &[f32], lanes: &mut [f32; LANES]) -> S::V {
-    match x.first_chunk::<LANES>() {
-        Some(x) => s.load(x),
-        None => {
-            lanes[..x.len()].copy_from_slice(x);
-            s.load(lanes)
+            let y = s.load_i32(&acc[r]).mul_add(s.splat(t.row_scales[r]) * scale, bias);
+            last.store(s, y, t.out, t.at + r * t.stride + p * LANES);
         }
     }
 }

@@ -10,12 +10,10 @@
 //! | `rows.rs` | rows of activations in the order of a tile |
 //! | `tile.rs` | the tile over `Dot8` |
 //! | `product.rs` | full tiles below one another with their epilogue |
-//! | `ahead.rs` | what a tile asks the caches for meanwhile |
 //! | `finish.rs` | the epilogue |
 //! | `table.rs` | the kernels |
 //! | `scalar.rs` `avx2.rs` `avx2wide.rs` `avxvnni.rs` `avx512vnni.rs` `neon.rs` `neondot.rs` | one `Dot8` each |
 
-pub(crate) mod ahead;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
@@ -37,14 +35,15 @@ pub mod table;
 pub(crate) mod tile;
 
 use super::Epilogue;
+use super::ahead::Ahead;
+use super::finish::Plus;
 use super::pack::{MAX_MR, NR};
 use crate::cpu::Ctx;
 use crate::mat::MatMut;
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
 use crate::quantize::{Before, QuantizeRow};
-use ahead::Ahead;
-use finish::{ColumnsS8, FinishS8, Plus};
+use finish::{ColumnsS8, FinishS8};
 use pack::{PanelsS8, QUAD, RowsS8, RowsS8Mut, STEP, padded_k};
 use product::ProductS8;
 use rows::{QuadPack, WidePack};

@@ -4,12 +4,13 @@
 //! took as many again. Here the usual epilogues, `y` and `out + y`, take sums from the registers where they are; the others read one
 //! tile of sums from memory, as everywhere. The arithmetic is that of `finish.rs`, so the bits are the same.
 
-use super::ahead::Ahead;
-use super::finish::{FinishS8, Plus};
+use super::finish::FinishS8;
 use super::pack::QUAD;
 use super::tile::{Dot8, MAX_NV, TileS8, begin, end, multiply};
 use crate::cpu::Kernels;
 use crate::gemm::Act;
+use crate::gemm::ahead::Ahead;
+use crate::gemm::finish::Plus;
 use crate::simd::{LANES, Simd, Vector};
 
 /// Full tiles of a product.
@@ -116,9 +117,9 @@ fn put<D: Dot8, S: Simd, const MR: usize, const NV: usize, const ADD: bool>(
     let (mut scale, mut bias, mut gamma) = ([s.splat(0.0); NV], [s.splat(0.0); NV], [s.splat(1.0); NV]);
     for v in 0..NV {
         scale[v] = s.load(&t.columns.scales[v]);
-        bias[v] = s.load(&t.columns.bias[v]);
+        bias[v] = s.load(&t.columns.rest.bias[v]);
         if ADD && t.gamma {
-            gamma[v] = s.load(&t.columns.gamma[v]);
+            gamma[v] = s.load(&t.columns.rest.gamma[v]);
         }
     }
     let row_scales = t.row_scales.first_chunk::<MR>().expect("a whole tile");

@@ -4,8 +4,8 @@
 //! rows side by side, `rows.rs`), or as windows of a quantized map, read in place. Written once over [`Dot8`]; every instruction set
 //! instantiates it. Sums are exact, so neither the order nor the blocking can show.
 
-use super::ahead::{Ahead, EARLY};
 use super::pack::{QUAD, STEP};
+use crate::gemm::ahead::{Ahead, EARLY};
 use crate::gemm::tile::Windows;
 use crate::prefetch::near_l1;
 use crate::simd::LANES;

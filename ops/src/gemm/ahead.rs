@@ -24,7 +24,7 @@ const NEXT_LINES: usize = 8;
 /// Fewest steps between two times: the loop around them costs a third of a tile of 32 steps when it runs for every one.
 const AT_LEAST: usize = 8;
 /// Steps between asking for operands and their use: some 100 cycles, more than the second-level cache takes.
-pub(super) const EARLY: usize = 8;
+pub(crate) const EARLY: usize = 8;
 
 impl Ahead {
     /// Nothing: points at operands that are near anyway.
@@ -37,14 +37,14 @@ impl Ahead {
         Ahead { out: first.cast(), stride: stride * size_of::<f32>(), any: true, ..self }
     }
 
-    /// With the weights `next` that come after these, `per_step` bytes for each step of the tile.
-    pub(crate) fn with_weights(self, next: *const i8, per_step: usize) -> Ahead {
-        Ahead { next: next.cast(), per_step, any: true, ..self }
+    /// With the weights `next` that come after these, `per_step` of them for each step of the tile.
+    pub(crate) fn with_weights<T>(self, next: *const T, per_step: usize) -> Ahead {
+        Ahead { next: next.cast(), per_step: per_step * size_of::<T>(), any: true, ..self }
     }
 
     /// For a loop of `steps` steps of a tile of `rows` x `NV` panels.
     #[inline(always)]
-    pub(super) fn over<const NV: usize>(self, rows: usize, steps: usize) -> Asking<NV> {
+    pub(crate) fn over<const NV: usize>(self, rows: usize, steps: usize) -> Asking<NV> {
         let each = (steps / rows).max(AT_LEAST);
         let at_once = rows.div_ceil((steps / each).max(1));
         let next_lines = (each * self.per_step).div_ceil(64).min(NEXT_LINES);
@@ -53,7 +53,7 @@ impl Ahead {
 }
 
 /// Asks for some rows of outputs and a share of the next weights now and then.
-pub(super) struct Asking<const NV: usize> {
+pub(crate) struct Asking<const NV: usize> {
     ahead: Ahead,
     /// Steps between two times.
     each: usize,
