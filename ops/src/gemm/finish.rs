@@ -134,14 +134,53 @@ fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &Finish) {
         acc[v] = &t.acc[v * t.acc_stride..].as_chunks::<LANES>().0[..t.rows];
         bias[v] = s.load(&t.columns.bias[v]);
     }
-    for r in 0..t.rows {
-        let at = t.at + r * t.stride;
-        // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
-        #[allow(unsafe_code)]
-        let out = unsafe { t.out.slice(at..at + NV * LANES) };
+    let mut done = 0;
+    while done < t.rows {
+        let lines = Lines { first: done, acc: &acc, bias: &bias };
+        done += if S::REGISTERS >= 32 && t.rows - done >= 4 {
+            finish_lines::<S, F, NV, 4>(s, t, lines);
+            4
+        } else {
+            finish_lines::<S, F, NV, 1>(s, t, lines);
+            1
+        };
+    }
+}
+
+/// Some rows of whole panels.
+struct Lines<'a, V, const NV: usize> {
+    first: usize,
+    acc: &'a [&'a [[f32; LANES]]; NV],
+    bias: &'a [V; NV],
+}
+
+/// `M` rows of it.
+#[inline(always)]
+fn finish_lines<S: Simd, F: Lanewise, const NV: usize, const M: usize>(s: S, t: &Finish, lines: Lines<S::V, NV>) {
+    let Lines { first, acc, bias } = lines;
+    let mut y = [[s.splat(0.0); NV]; M];
+    for r in 0..M {
+        for v in 0..NV {
+            y[r][v] = s.load(&acc[v][first + r]) + bias[v];
+        }
+    }
+    put_lines(t.out, (t.at + first * t.stride, t.stride), F::apply_all(s, y));
+}
+
+/// Whole vectors of some rows to the output, from a place on, rows so many values apart.
+#[inline(always)]
+pub(crate) fn put_lines<V: Vector, const NV: usize, const M: usize>(
+    out: &SharedMut<f32>,
+    (at, stride): (usize, usize),
+    y: [[V; NV]; M],
+) {
+    // SAFETY: every output belongs to one tile of one task, and the pieces live only in this function.
+    #[allow(unsafe_code)]
+    let out = unsafe { out.lines::<M>(at, stride, NV * LANES) };
+    for (r, out) in out.into_iter().enumerate() {
         let out = &mut out.as_chunks_mut::<LANES>().0[..NV];
         for v in 0..NV {
-            F::apply(s, s.load(&acc[v][r]) + bias[v]).store(&mut out[v]);
+            y[r][v].store(&mut out[v]);
         }
     }
 }

@@ -217,6 +217,17 @@ pub(crate) fn padded(x: &[f32], fill: f32) -> [f32; LANES] {
 pub(crate) trait Lanewise {
     /// Of every lane.
     fn apply<S: Simd>(s: S, x: S::V) -> S::V;
+    /// Of several vectors at once.
+    #[inline(always)]
+    fn apply_all<S: Simd, const N: usize, const M: usize>(s: S, mut x: [[S::V; N]; M]) -> [[S::V; N]; M] {
+        // A loop: `map` of arrays is not inlined, and a closure outside of the instruction set calls every operation.
+        for m in 0..M {
+            for n in 0..N {
+                x[m][n] = Self::apply(s, x[m][n]);
+            }
+        }
+        x
+    }
 }
 
 /// x = F(x) over a slice of any length.

@@ -4,7 +4,7 @@ use super::pack::PanelsS8;
 use super::tile::MAX_NV;
 use crate::activation::{Gelu, Relu};
 use crate::gemm::Act;
-use crate::gemm::finish::{Columns, Last, Plus, Same, sixteen};
+use crate::gemm::finish::{Columns, Last, Plus, Same, put_lines, sixteen};
 use crate::par::SharedMut;
 use crate::simd::{LANES, Lanewise, Simd, Vector};
 
@@ -99,17 +99,39 @@ fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &FinishS8) {
         scale[v] = s.load(&t.columns.scales[v]);
         bias[v] = s.load(&t.columns.rest.bias[v]);
     }
-    for r in 0..rows {
-        let at = t.at + r * t.stride;
-        // SAFETY: every output belongs to one tile of one task, and a piece lives only in this loop.
-        #[allow(unsafe_code)]
-        let out = unsafe { t.out.slice(at..at + NV * LANES) };
-        let out = &mut out.as_chunks_mut::<LANES>().0[..NV];
-        let row = s.splat(t.row_scales[r]);
+    let mut done = 0;
+    while done < rows {
+        let lines = Lines { first: done, acc: &acc, scale: &scale, bias: &bias };
+        done += if S::REGISTERS >= 32 && rows - done >= 4 {
+            finish_lines::<S, F, NV, 4>(s, t, lines);
+            4
+        } else {
+            finish_lines::<S, F, NV, 1>(s, t, lines);
+            1
+        };
+    }
+}
+
+/// Some rows of whole panels.
+struct Lines<'a, V, const NV: usize> {
+    first: usize,
+    acc: &'a [&'a [[i32; LANES]]; NV],
+    scale: &'a [V; NV],
+    bias: &'a [V; NV],
+}
+
+/// `M` rows of it.
+#[inline(always)]
+fn finish_lines<S: Simd, F: Lanewise, const NV: usize, const M: usize>(s: S, t: &FinishS8, lines: Lines<S::V, NV>) {
+    let Lines { first, acc, scale, bias } = lines;
+    let mut y = [[s.splat(0.0); NV]; M];
+    for r in 0..M {
+        let row = s.splat(t.row_scales[first + r]);
         for v in 0..NV {
-            F::apply(s, s.load_i32(&acc[v][r]).mul_add(row * scale[v], bias[v])).store(&mut out[v]);
+            y[r][v] = s.load_i32(&acc[v][first + r]).mul_add(row * scale[v], bias[v]);
         }
     }
+    put_lines(t.out, (t.at + first * t.stride, t.stride), F::apply_all(s, y));
 }
 
 /// Any tile.
