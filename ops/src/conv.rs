@@ -11,7 +11,10 @@ use crate::gemm::ahead::Ahead;
 use crate::gemm::finish::{Columns, Plus};
 use crate::gemm::pack::{Change, MAX_MR, RowPack};
 use crate::gemm::tile::Tile;
-use crate::gemm::{Act, Finished, KC, MAX_NV, NR, Out, Panels, Product, Rows, Sink, Source, finish_tile, product};
+use crate::gemm::{
+    Act, Finished, KC, MAX_NV, NR, Out, PanelData, Panels, Product, Rows, Sink, Source, WeightType, finish_tile,
+    product,
+};
 use crate::mat::{Hwc, HwcMut};
 use crate::opclock::{self, Op, Work};
 use crate::par::SharedMut;
@@ -81,6 +84,13 @@ pub fn conv_transpose_rows(weight: &[f32], inp: usize, out: usize, kernel: usize
 const BUDGET: usize = 1 << 17;
 /// Fewest lines of a band.
 const FEWEST: usize = 2;
+/// Most inputs of a window whose f16 weights are widened for a band: a group of panels is then 72 KiB of f32.
+const WIDEN: usize = 576;
+
+/// Values of a group of panels that is widened.
+fn wide(k: usize) -> usize {
+    if k <= WIDEN { k * MAX_NV * NR } else { 0 }
+}
 
 fn shape((h, w, c): (usize, usize, usize), kernel: usize, stride: usize, pad: usize) -> Shape {
     let (oh, ow) = (conv_out(h, kernel, stride, pad), conv_out(w, kernel, stride, pad));
@@ -89,10 +99,13 @@ fn shape((h, w, c): (usize, usize, usize), kernel: usize, stride: usize, pad: us
 
 /// Most f32 values of working memory that each thread of the pool keeps after [`conv2d`] with windows that overlap, `x` being (height,
 /// width, channels) of the input, whatever the kernel; for memory plans. Up to 512 KiB of map (more only where two lines of output
-/// need more) beside some 20 KiB. For other windows see [`crate::gemm::working_memory`].
+/// need more) beside at most 96 KiB. For other windows see [`crate::gemm::working_memory`].
 pub fn working_memory_conv(x: (usize, usize, usize), kernel: usize, stride: usize, pad: usize) -> usize {
     let shape = shape(x, kernel, stride, pad);
-    if shape.oh * shape.ow == 0 { 0 } else { shape.map(shape.band(BUDGET, FEWEST)) + TILES * MAX_MR * MAX_NV * NR }
+    if shape.oh * shape.ow == 0 {
+        return 0;
+    }
+    shape.map(shape.band(BUDGET, FEWEST)) + TILES * MAX_MR * MAX_NV * NR + wide(kernel * kernel * x.2)
 }
 
 /// Convolution whose windows overlap: bands of a padded map, windows in place.
@@ -104,16 +117,18 @@ fn overlapping(ctx: Ctx, x: Hwc, conv: &Conv, p: &Product) {
     }
     let kernel = ctx.kernels.gemm(weight.data.weights());
     let band = shape.band(BUDGET, FEWEST);
-    let scratch = shape.map(band) + TILES * kernel.mr * kernel.nr;
+    let wide = if kernel.weights == WeightType::F16 { wide(weight.k) } else { 0 };
+    let scratch = shape.map(band) + TILES * kernel.mr * kernel.nr + wide;
     let most = working_memory_conv((x.h, x.w, x.c), conv.kernel, conv.stride, conv.pad);
     assert!(scratch <= most, "{scratch} values of working memory, {most} announced");
     ctx.pool.reserve_scratch(scratch);
     ctx.pool.run(shape.oh.div_ceil(band), &|task, worker| {
         let rows = task * band..((task + 1) * band).min(shape.oh);
         ctx.pool.with_scratch(worker, scratch, |memory| {
+            let (wide, memory) = memory.split_at_mut(wide);
             let (acc, map) = memory.split_at_mut(TILES * kernel.mr * kernel.nr);
             fill(ctx, x, &shape, conv.relu_input == Act::Relu, rows.start, &mut map[..shape.map(rows.len())]);
-            multiply(ctx, p, &shape, rows, (map, acc));
+            multiply(ctx, p, &shape, rows, (map, acc, wide));
         });
     });
 }
@@ -138,13 +153,27 @@ fn fill(ctx: Ctx, x: Hwc, shape: &Shape, relu: bool, first: usize, map: &mut [f3
 }
 
 /// Every output of a band.
-fn multiply(ctx: Ctx, p: &Product, shape: &Shape, rows: std::ops::Range<usize>, (map, acc): (&[f32], &mut [f32])) {
+fn multiply(
+    ctx: Ctx,
+    p: &Product,
+    shape: &Shape,
+    rows: std::ops::Range<usize>,
+    (map, acc, wide): (&[f32], &mut [f32], &mut [f32]),
+) {
     let Panels { n, k, data } = p.w;
     let kernel = ctx.kernels.gemm(data.weights());
     let (mr, nv) = (kernel.mr, kernel.nr / NR);
     for panel in (0..n.div_ceil(NR)).step_by(nv) {
         let panels = nv.min(n.div_ceil(NR) - panel);
         let columns = Columns::of(n, (panel, panels), p.bias, None);
+        let w = match data.from(panel * k * NR) {
+            // Once for all tiles of the band.
+            PanelData::F16(w) if !wide.is_empty() => {
+                ctx.kernels.widen(&w[..panels * k * NR], wide);
+                PanelData::F32(&*wide)
+            }
+            w => w,
+        };
         let near = Ahead::nothing(map);
         let ahead_of = |step: &Step| match (&p.out, step.done) {
             (Out::Rows { out, stride, .. }, Some(row)) => near.with_outputs(out.at(row * stride + panel * NR), *stride),
@@ -157,7 +186,7 @@ fn multiply(ctx: Ctx, p: &Product, shape: &Shape, rows: std::ops::Range<usize>, 
                 panels,
                 k: step.run,
                 a: &map[step.at..],
-                w: data.from((panel * k + step.k) * NR),
+                w: w.from(step.k * NR),
                 w_stride: k * NR,
                 start: step.start,
                 acc: &mut *acc,

@@ -104,6 +104,11 @@ const PACKED: usize = 1 << 16;
 const TILES: usize = 8;
 /// Steps of k between which a panel pair stays in the first-level cache: 256 * 32 columns = 32 KiB of f32.
 pub(crate) const KC: usize = 256;
+/// A block of a group of f16 panels as f32.
+const WIDE: usize = KC * MAX_NV * NR;
+/// Fewest tiles of rows for which f16 panels are widened once instead of in each tile, where that takes two of 26 vector instructions a step
+/// and their places in both pipes.
+const WIDEN: usize = 3;
 /// Tasks wanted, so that a few threads finish together.
 const TASKS: usize = 16;
 /// Fewest panels per task: packing the rows again costs about 2 % of 64 columns' multiply-adds.
@@ -114,7 +119,7 @@ pub(crate) const MAX_NV: usize = 2;
 /// Most f32 values of working memory that each thread of the pool keeps after products (or convolutions whose windows do not
 /// overlap) of up to `k` inputs, whatever the kernel; for memory plans.
 pub fn working_memory(k: usize) -> usize {
-    PACKED.max(MAX_MR * k) + TILES * MAX_MR * MAX_NV * NR
+    PACKED.max(MAX_MR * k) + TILES * MAX_MR * MAX_NV * NR + WIDE
 }
 
 /// Runs a product: tasks are blocks of rows times groups of panels, chosen by the shape alone.
@@ -134,7 +139,8 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
     let group = panels.div_ceil(wanted).next_multiple_of(nv);
     let col_tasks = panels.div_ceil(group);
 
-    let scratch = block * (k + nv * NR);
+    let wide = if kernel.weights == WeightType::F16 { WIDE } else { 0 };
+    let scratch = block * (k + nv * NR) + wide;
     assert!(scratch <= working_memory(k), "{scratch} values of working memory for {k} inputs");
     ctx.pool.reserve_scratch(scratch);
     ctx.pool.run(row_tasks * col_tasks, &|task, worker| {
@@ -143,7 +149,8 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
         let from = task % col_tasks * group;
         let to = (from + group).min(panels);
         ctx.pool.with_scratch(worker, scratch, |memory| {
-            let (packed, acc) = memory.split_at_mut(block * k);
+            let (packed, rest) = memory.split_at_mut(block * k);
+            let (acc, wide) = rest.split_at_mut(block * nv * NR);
             let mut r = 0;
             while r < rows {
                 let here = mr.min(rows - r);
@@ -153,7 +160,7 @@ pub(crate) fn product(ctx: Ctx, p: &Product) {
             let mut panel = from;
             while panel < to {
                 let here = nv.min(to - panel);
-                block_of_panels(ctx.kernels, p, Part { first, rows, panel, panels: here }, packed, acc);
+                block_of_panels(ctx.kernels, p, Part { first, rows, panel, panels: here }, packed, (acc, wide));
                 panel += here;
             }
         });
@@ -168,7 +175,7 @@ struct Part {
     panels: usize,
 }
 
-fn block_of_panels(kernels: &Kernels, p: &Product, c: Part, packed: &[f32], acc: &mut [f32]) {
+fn block_of_panels(kernels: &Kernels, p: &Product, c: Part, packed: &[f32], (acc, wide): (&mut [f32], &mut [f32])) {
     let kernel = kernels.gemm(p.w.data.weights());
     let (k, mr) = (p.w.k, kernel.mr);
     let size = mr * NR * c.panels;
@@ -179,7 +186,15 @@ fn block_of_panels(kernels: &Kernels, p: &Product, c: Part, packed: &[f32], acc:
     loop {
         let steps = KC.min(k - k0);
         let last = k0 + steps == k;
-        let w = p.w.data.from((c.panel * k + k0) * NR);
+        let (w, w_stride) = match p.w.data.from((c.panel * k + k0) * NR) {
+            PanelData::F16(w) if c.rows > (WIDEN - 1) * mr => {
+                for (v, wide) in wide.chunks_mut(KC * NR).enumerate().take(c.panels) {
+                    kernels.widen(&w[v * k * NR..][..steps * NR], wide);
+                }
+                (PanelData::F32(&*wide), KC * NR)
+            }
+            w => (w, k * NR),
+        };
         for r in (0..c.rows).step_by(mr) {
             let (tile, here) = (r / mr, mr.min(c.rows - r));
             let rows = kernel.fit(here);
@@ -195,7 +210,7 @@ fn block_of_panels(kernels: &Kernels, p: &Product, c: Part, packed: &[f32], acc:
                 k: steps,
                 a: &packed[r * k + k0 * rows..][..steps * rows],
                 w,
-                w_stride: k * NR,
+                w_stride,
                 start: k0 == 0,
                 acc: &mut *acc,
                 acc_stride: mr * NR,

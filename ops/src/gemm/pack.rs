@@ -191,6 +191,14 @@ pub(crate) fn pack_rows<S: Simd>(s: S, t: RowPack) {
     }
 }
 
+/// f16 bits, whole vectors, as f32; exact.
+#[inline(always)]
+pub(crate) fn widen<S: Simd>(s: S, x: &[u16], out: &mut [f32]) {
+    for (x, out) in x.as_chunks::<LANES>().0.iter().zip(out.as_chunks_mut::<LANES>().0) {
+        s.load_f16(x).store(out);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -52,6 +52,8 @@ pub struct VectorKernels {
     pub(crate) finish: unsafe fn(Finish),
     /// `gemm::pack::pack_rows`.
     pub(crate) pack: unsafe fn(RowPack),
+    /// `gemm::pack::widen`.
+    pub(crate) widen: unsafe fn(&[u16], &mut [f32]),
     /// `gemm::s8::rows::pack_quads`.
     pub(crate) pack_quads: unsafe fn(QuadPack),
     /// `gemm::s8::rows::pack_wide`.
@@ -140,6 +142,10 @@ macro_rules! vector_kernels {
                 crate::gemm::pack::pack_rows($token::new(), rows);
             }
             $(#[target_feature(enable = $features)])?
+            fn widen(x: &[u16], out: &mut [f32]) {
+                crate::gemm::pack::widen($token::new(), x, out);
+            }
+            $(#[target_feature(enable = $features)])?
             fn pack_quads(rows: crate::gemm::s8::rows::QuadPack) {
                 crate::gemm::s8::rows::pack_quads($token::new(), rows);
             }
@@ -191,6 +197,7 @@ macro_rules! vector_kernels {
                 pack_values,
                 finish,
                 pack,
+                widen,
                 pack_quads,
                 pack_wide,
                 finish_s8,
@@ -286,6 +293,12 @@ impl Kernels {
     pub(crate) fn pack(&self, rows: RowPack) {
         // SAFETY: chosen under the detected features.
         unsafe { (self.vector.pack)(rows) }
+    }
+
+    #[inline]
+    pub(crate) fn widen(&self, x: &[u16], out: &mut [f32]) {
+        // SAFETY: chosen under the detected features.
+        unsafe { (self.vector.widen)(x, out) }
     }
 
     #[inline]
