@@ -70,37 +70,13 @@ const PHI: [f32; 16] = [
     1.309_281_14e-1,
 ];
 
-/// P(z) of z in [-5.4, 5.4]: the normal distribution function is 1/2 + z P.
+/// P(z) of several vectors z in [-5.4, 5.4]: the normal distribution function is 1/2 + z P.
 #[inline(always)]
-fn phi<S: Simd>(s: S, z: S::V) -> S::V {
-    let t = (z * z).mul_add(s.splat(2.0 / (PHI_MAX * PHI_MAX)), s.splat(-1.0));
-    let mut p = s.splat(PHI[0]);
-    for c in &PHI[1..] {
-        p = p.mul_add(t, s.splat(*c));
-    }
-    p
-}
-
-/// x Phi(x); NaN stays NaN.
-#[inline(always)]
-pub(crate) fn gelu_lanes<S: Simd>(s: S, x: S::V) -> S::V {
-    // Minus infinity is cut too: times a Phi of 0 it would be NaN.
-    let x = s.splat(-PHI_MAX).max(x);
-    let z = s.splat(PHI_MAX).min(x);
-    // At the lower end 1/2 + z P is -3e-8.
-    x * s.splat(0.0).max(z.mul_add(phi(s, z), s.splat(0.5)))
-}
-
-/// The same of several vectors step by step: one alone is a chain of 22 steps of four cycles each, of which out-of-order execution
-/// overlaps some four.
-#[inline(always)]
-fn gelu_all<S: Simd, const N: usize, const M: usize>(s: S, x: [[S::V; N]; M]) -> [[S::V; N]; M] {
-    let zero = s.splat(0.0);
-    let (mut t, mut p, mut y) = ([[zero; N]; M], [[s.splat(PHI[0]); N]; M], x);
+fn phi<S: Simd, const N: usize, const M: usize>(s: S, z: &[[S::V; N]; M]) -> [[S::V; N]; M] {
+    let (mut t, mut p) = ([[s.splat(0.0); N]; M], [[s.splat(PHI[0]); N]; M]);
     for m in 0..M {
         for n in 0..N {
-            let z = s.splat(PHI_MAX).min(s.splat(-PHI_MAX).max(x[m][n]));
-            t[m][n] = (z * z).mul_add(s.splat(2.0 / (PHI_MAX * PHI_MAX)), s.splat(-1.0));
+            t[m][n] = (z[m][n] * z[m][n]).mul_add(s.splat(2.0 / (PHI_MAX * PHI_MAX)), s.splat(-1.0));
         }
     }
     for c in &PHI[1..] {
@@ -111,14 +87,34 @@ fn gelu_all<S: Simd, const N: usize, const M: usize>(s: S, x: [[S::V; N]; M]) ->
             }
         }
     }
+    p
+}
+
+/// x Phi(x); NaN stays NaN.
+#[inline(always)]
+pub(crate) fn gelu_lanes<S: Simd>(s: S, x: S::V) -> S::V {
+    gelu_all(s, [[x]])[0][0]
+}
+
+/// The same of several vectors: eight at a time take 0.93 of the time of an int8 product whose outputs go through it one by one (AVX-512).
+#[inline(always)]
+fn gelu_all<S: Simd, const N: usize, const M: usize>(s: S, mut x: [[S::V; N]; M]) -> [[S::V; N]; M] {
+    let mut z = x;
     for m in 0..M {
         for n in 0..N {
-            let x = s.splat(-PHI_MAX).max(x[m][n]);
-            let z = s.splat(PHI_MAX).min(x);
-            y[m][n] = x * zero.max(z.mul_add(p[m][n], s.splat(0.5)));
+            // Minus infinity is cut too: times a Phi of 0 it would be NaN.
+            x[m][n] = s.splat(-PHI_MAX).max(x[m][n]);
+            z[m][n] = s.splat(PHI_MAX).min(x[m][n]);
         }
     }
-    y
+    let p = phi(s, &z);
+    for m in 0..M {
+        for n in 0..N {
+            // At the lower end 1/2 + z P is -3e-8.
+            x[m][n] = x[m][n] * s.splat(0.0).max(z[m][n].mul_add(p[m][n], s.splat(0.5)));
+        }
+    }
+    x
 }
 
 /// erf(x) = 2 (Phi(x sqrt 2) - 1/2); about 1e-7 absolute.
@@ -126,7 +122,7 @@ fn gelu_all<S: Simd, const N: usize, const M: usize>(s: S, x: [[S::V; N]; M]) ->
 fn erf_lanes<S: Simd>(s: S, x: S::V) -> S::V {
     let x = x * s.splat(std::f32::consts::SQRT_2);
     let z = s.splat(PHI_MAX).min(s.splat(-PHI_MAX).max(x));
-    let p = phi(s, z);
+    let [[p]] = phi(s, &[[z]]);
     z * (p + p)
 }
 

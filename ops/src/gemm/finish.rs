@@ -1,5 +1,5 @@
-//! The epilogue of f32 tiles: bias, activation, gamma, residual, from sums in the cache to the output in one pass; and the steps
-//! that the int8 epilogue (`s8/finish.rs`) has in common with it.
+//! The epilogue of tiles: bias, activation, gamma, residual, from sums in the cache to the output in one pass. Written once over [`Sums`]; what
+//! an integer sum is before that stands in `s8/finish.rs`.
 
 use super::{Act, MAX_NV};
 use crate::activation::{Gelu, Relu, gelu_lanes, relu_lanes};
@@ -99,24 +99,63 @@ pub(crate) struct Finish<'a> {
     pub cols: usize,
 }
 
-/// y = act(acc + bias) * gamma; out = out + y or y. Every step rounds once.
+impl Sums for Finish<'_> {
+    #[inline(always)]
+    fn y<S: Simd>(&self, s: S, row: usize, panel: usize) -> S::V {
+        let sum = s.load(&self.acc[panel * self.acc_stride..].as_chunks().0[row]);
+        if self.bias { sum + s.load(&self.columns.bias[panel]) } else { sum }
+    }
+
+    #[inline(always)]
+    fn to(&self) -> To<'_> {
+        let Finish { panels, rows, columns, act, gamma, plus, out, at, stride, cols, .. } = *self;
+        To { panels, rows, act, gamma: gamma.then_some(columns), plus, relu_sum: false, out, at, stride, cols }
+    }
+}
+
+/// A tile of sums on its way to the output, of f32 or of integers.
+pub(crate) trait Sums {
+    /// Sixteen sums of a row and panel, scaled and with the bias.
+    fn y<S: Simd>(&self, s: S, row: usize, panel: usize) -> S::V;
+    /// What happens to them then.
+    fn to(&self) -> To<'_>;
+}
+
+/// The part of an epilogue behind scales and bias; fields as in [`Finish`].
+pub(crate) struct To<'a> {
+    pub panels: usize,
+    pub rows: usize,
+    pub act: Act,
+    /// Factors, where there are any.
+    pub gamma: Option<&'a Columns>,
+    pub plus: Plus<'a>,
+    /// Whether the output is rectified after what is added.
+    pub relu_sum: bool,
+    pub out: &'a SharedMut<'a, f32>,
+    pub at: usize,
+    pub stride: usize,
+    pub cols: usize,
+}
+
+/// y = act(y) * gamma; out = out + y or y. Every step rounds once.
 #[inline(always)]
-pub(crate) fn finish<S: Simd>(s: S, t: Finish) {
-    let whole = t.cols == t.panels * LANES && t.bias && !t.gamma && matches!(t.plus, Plus::Nothing);
+pub(crate) fn finish<S: Simd>(s: S, t: &impl Sums) {
+    let to = t.to();
+    let whole = to.cols == to.panels * LANES && to.gamma.is_none() && !to.relu_sum && matches!(to.plus, Plus::Nothing);
     // Most tiles: nothing to decide for each vector.
-    match (whole, t.panels, t.act) {
-        (true, 2, Act::None) => finish_whole::<S, Same, 2>(s, &t),
-        (true, 2, Act::Gelu) => finish_whole::<S, Gelu, 2>(s, &t),
-        (true, 2, Act::Relu) => finish_whole::<S, Relu, 2>(s, &t),
-        (true, 1, Act::None) => finish_whole::<S, Same, 1>(s, &t),
-        (true, 1, Act::Gelu) => finish_whole::<S, Gelu, 1>(s, &t),
-        (true, 1, Act::Relu) => finish_whole::<S, Relu, 1>(s, &t),
-        _ => finish_any(s, &t),
+    match (whole, to.panels, to.act) {
+        (true, 2, Act::None) => finish_whole::<S, _, Same, 2>(s, t, &to),
+        (true, 2, Act::Gelu) => finish_whole::<S, _, Gelu, 2>(s, t, &to),
+        (true, 2, Act::Relu) => finish_whole::<S, _, Relu, 2>(s, t, &to),
+        (true, 1, Act::None) => finish_whole::<S, _, Same, 1>(s, t, &to),
+        (true, 1, Act::Gelu) => finish_whole::<S, _, Gelu, 1>(s, t, &to),
+        (true, 1, Act::Relu) => finish_whole::<S, _, Relu, 1>(s, t, &to),
+        _ => finish_any(s, t, &to),
     }
 }
 
 /// No activation.
-pub(crate) struct Same;
+struct Same;
 
 impl Lanewise for Same {
     #[inline(always)]
@@ -125,58 +164,34 @@ impl Lanewise for Same {
     }
 }
 
-/// Whole panels with a bias, activation `F`, nothing added.
+/// Whole panels, activation `F`, nothing added.
 #[inline(always)]
-fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &Finish) {
-    let mut acc: [&[[f32; LANES]]; NV] = [&[]; NV];
-    let mut bias = [s.splat(0.0); NV];
-    for v in 0..NV {
-        acc[v] = &t.acc[v * t.acc_stride..].as_chunks::<LANES>().0[..t.rows];
-        bias[v] = s.load(&t.columns.bias[v]);
-    }
+fn finish_whole<S: Simd, T: Sums, F: Lanewise, const NV: usize>(s: S, t: &T, to: &To) {
     let mut done = 0;
-    while done < t.rows {
-        let lines = Lines { first: done, acc: &acc, bias: &bias };
-        done += if S::REGISTERS >= 32 && t.rows - done >= 4 {
-            finish_lines::<S, F, NV, 4>(s, t, lines);
+    while done < to.rows {
+        done += if S::REGISTERS >= 32 && to.rows - done >= 4 {
+            finish_lines::<S, T, F, NV, 4>(s, t, to, done);
             4
         } else {
-            finish_lines::<S, F, NV, 1>(s, t, lines);
+            finish_lines::<S, T, F, NV, 1>(s, t, to, done);
             1
         };
     }
 }
 
-/// Some rows of whole panels.
-struct Lines<'a, V, const NV: usize> {
-    first: usize,
-    acc: &'a [&'a [[f32; LANES]]; NV],
-    bias: &'a [V; NV],
-}
-
 /// `M` rows of it.
 #[inline(always)]
-fn finish_lines<S: Simd, F: Lanewise, const NV: usize, const M: usize>(s: S, t: &Finish, lines: Lines<S::V, NV>) {
-    let Lines { first, acc, bias } = lines;
+fn finish_lines<S: Simd, T: Sums, F: Lanewise, const NV: usize, const M: usize>(s: S, t: &T, to: &To, first: usize) {
     let mut y = [[s.splat(0.0); NV]; M];
     for r in 0..M {
         for v in 0..NV {
-            y[r][v] = s.load(&acc[v][first + r]) + bias[v];
+            y[r][v] = t.y(s, first + r, v);
         }
     }
-    put_lines(t.out, (t.at + first * t.stride, t.stride), F::apply_all(s, y));
-}
-
-/// Whole vectors of some rows to the output, from a place on, rows so many values apart.
-#[inline(always)]
-pub(crate) fn put_lines<V: Vector, const NV: usize, const M: usize>(
-    out: &SharedMut<f32>,
-    (at, stride): (usize, usize),
-    y: [[V; NV]; M],
-) {
+    let y = F::apply_all(s, y);
     // SAFETY: every output belongs to one tile of one task, and the pieces live only in this function.
     #[allow(unsafe_code)]
-    let out = unsafe { out.lines::<M>(at, stride, NV * LANES) };
+    let out = unsafe { to.out.lines::<M>(to.at + first * to.stride, to.stride, NV * LANES) };
     for (r, out) in out.into_iter().enumerate() {
         let out = &mut out.as_chunks_mut::<LANES>().0[..NV];
         for v in 0..NV {
@@ -187,69 +202,44 @@ pub(crate) fn put_lines<V: Vector, const NV: usize, const M: usize>(
 
 /// Any tile.
 #[inline(always)]
-fn finish_any<S: Simd>(s: S, t: &Finish) {
-    for p in 0..t.panels {
-        let acc = &t.acc[p * t.acc_stride..].as_chunks::<LANES>().0[..t.rows];
-        let bias = s.load(&t.columns.bias[p]);
-        let last = Last {
-            act: t.act,
-            gamma: t.gamma.then(|| s.load(&t.columns.gamma[p])),
-            plus: t.plus,
-            relu_sum: false,
-            cols: LANES.min(t.cols - p * LANES),
-        };
-        for (r, acc) in acc.iter().enumerate() {
-            let sum = s.load(acc);
-            let y = if t.bias { sum + bias } else { sum };
-            last.store(s, y, t.out, t.at + r * t.stride + p * LANES);
+fn finish_any<S: Simd>(s: S, t: &impl Sums, to: &To) {
+    for p in 0..to.panels {
+        let gamma = to.gamma.map(|columns| s.load(&columns.gamma[p]));
+        let cols = LANES.min(to.cols - p * LANES);
+        for r in 0..to.rows {
+            store_last(s, t.y(s, r, p), (gamma, cols), to, to.at + r * to.stride + p * LANES);
         }
     }
 }
 
-/// The last steps of up to sixteen outputs.
-pub(crate) struct Last<'a, V> {
-    /// Activation.
-    pub act: Act,
-    /// Factors, where there are any.
-    pub gamma: Option<V>,
-    /// What is added.
-    pub plus: Plus<'a>,
-    /// Whether the output is rectified after that.
-    pub relu_sum: bool,
-    /// Outputs in use.
-    pub cols: usize,
-}
-
-impl<V: Vector> Last<'_, V> {
-    /// y = act(y) * gamma; out = out + y or y, from `at` on.
-    #[inline(always)]
-    pub(crate) fn store<S: Simd<V = V>>(&self, s: S, mut y: V, out: &SharedMut<f32>, at: usize) {
-        match self.act {
-            Act::None => {}
-            Act::Gelu => y = gelu_lanes(s, y),
-            Act::Relu => y = relu_lanes(s, y),
-        }
-        if let Some(gamma) = self.gamma {
-            y = y * gamma;
-        }
-        // SAFETY: every output belongs to one tile of one task, and a piece lives only in this function.
-        #[allow(unsafe_code)]
-        let out = unsafe { out.slice(at..at + self.cols) };
-        let mut lanes = [0.0; LANES];
-        match self.plus {
-            Plus::Nothing => {}
-            Plus::Output => y = load_some(s, out, &mut lanes) + y,
-            Plus::Other(x) => y = load_some(s, &x[at..at + self.cols], &mut lanes) + y,
-        }
-        if self.relu_sum {
-            y = relu_lanes(s, y);
-        }
-        match out.first_chunk_mut::<LANES>() {
-            Some(out) => y.store(out),
-            None => {
-                y.store(&mut lanes);
-                out.copy_from_slice(&lanes[..out.len()]);
-            }
+/// The last steps of up to sixteen outputs, from `at` on.
+#[inline(always)]
+fn store_last<S: Simd>(s: S, mut y: S::V, (gamma, cols): (Option<S::V>, usize), to: &To, at: usize) {
+    match to.act {
+        Act::None => {}
+        Act::Gelu => y = gelu_lanes(s, y),
+        Act::Relu => y = relu_lanes(s, y),
+    }
+    if let Some(gamma) = gamma {
+        y = y * gamma;
+    }
+    // SAFETY: every output belongs to one tile of one task, and a piece lives only in this function.
+    #[allow(unsafe_code)]
+    let out = unsafe { to.out.slice(at..at + cols) };
+    let mut lanes = [0.0; LANES];
+    match to.plus {
+        Plus::Nothing => {}
+        Plus::Output => y = load_some(s, out, &mut lanes) + y,
+        Plus::Other(x) => y = load_some(s, &x[at..at + cols], &mut lanes) + y,
+    }
+    if to.relu_sum {
+        y = relu_lanes(s, y);
+    }
+    match out.first_chunk_mut::<LANES>() {
+        Some(out) => y.store(out),
+        None => {
+            y.store(&mut lanes);
+            out.copy_from_slice(&lanes[..out.len()]);
         }
     }
 }

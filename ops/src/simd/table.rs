@@ -135,7 +135,7 @@ macro_rules! vector_kernels {
             }
             $(#[target_feature(enable = $features)])?
             fn finish(tile: crate::gemm::finish::Finish) {
-                crate::gemm::finish::finish($token::new(), tile);
+                crate::gemm::finish::finish($token::new(), &tile);
             }
             $(#[target_feature(enable = $features)])?
             fn pack(rows: crate::gemm::pack::RowPack) {
@@ -155,7 +155,7 @@ macro_rules! vector_kernels {
             }
             $(#[target_feature(enable = $features)])?
             fn finish_s8(tile: crate::gemm::s8::finish::FinishS8) {
-                crate::gemm::s8::finish::finish($token::new(), tile);
+                crate::gemm::finish::finish($token::new(), &tile);
             }
             $(#[target_feature(enable = $features)])?
             fn rotate(x: &mut [f32], signs: &[u16], block: usize) {

@@ -1,12 +1,11 @@
-//! The epilogue of int8 tiles: sums to f32, bias, activation, gamma, residual, while they are in the cache.
+//! The epilogue of int8 tiles: integer sums to f32 with scales and bias; the rest is that of every tile.
 
 use super::pack::PanelsS8;
 use super::tile::MAX_NV;
-use crate::activation::{Gelu, Relu};
 use crate::gemm::Act;
-use crate::gemm::finish::{Columns, Last, Plus, Same, put_lines, sixteen};
+use crate::gemm::finish::{Columns, Plus, Sums, To, sixteen};
 use crate::par::SharedMut;
-use crate::simd::{LANES, Lanewise, Simd, Vector};
+use crate::simd::{LANES, Simd, Vector};
 
 /// The epilogue of one tile of sums.
 #[derive(Clone, Copy)]
@@ -71,87 +70,19 @@ impl ColumnsS8 {
     }
 }
 
-/// y = act(fma(acc, row scale * output scale, bias)) * gamma; out = out + y or y. Every step rounds once.
-#[inline(always)]
-pub(crate) fn finish<S: Simd>(s: S, t: FinishS8) {
-    let whole = t.cols == t.panels * LANES && !t.gamma && !t.relu_sum && matches!(t.plus, Plus::Nothing);
-    // Most tiles: nothing to decide for each vector.
-    match (whole, t.panels, t.act) {
-        (true, 2, Act::None) => finish_whole::<S, Same, 2>(s, &t),
-        (true, 2, Act::Gelu) => finish_whole::<S, Gelu, 2>(s, &t),
-        (true, 2, Act::Relu) => finish_whole::<S, Relu, 2>(s, &t),
-        (true, 1, Act::None) => finish_whole::<S, Same, 1>(s, &t),
-        (true, 1, Act::Gelu) => finish_whole::<S, Gelu, 1>(s, &t),
-        (true, 1, Act::Relu) => finish_whole::<S, Relu, 1>(s, &t),
-        _ => finish_any(s, &t),
+/// y = act(fma(acc, row scale * output scale, bias)), then as [`crate::gemm::finish`].
+impl Sums for FinishS8<'_> {
+    #[inline(always)]
+    fn y<S: Simd>(&self, s: S, row: usize, panel: usize) -> S::V {
+        let sum = s.load_i32(&self.acc[panel * self.acc_stride..].as_chunks().0[row]);
+        let scale = s.splat(self.row_scales[row]) * s.load(&self.columns.scales[panel]);
+        sum.mul_add(scale, s.load(&self.columns.rest.bias[panel]))
     }
-}
 
-/// Whole panels, activation `F`, nothing added.
-#[inline(always)]
-fn finish_whole<S: Simd, F: Lanewise, const NV: usize>(s: S, t: &FinishS8) {
-    let rows = t.row_scales.len();
-    let mut acc: [&[[i32; LANES]]; NV] = [&[]; NV];
-    let mut scale = [s.splat(0.0); NV];
-    let mut bias = [s.splat(0.0); NV];
-    for v in 0..NV {
-        acc[v] = &t.acc[v * t.acc_stride..].as_chunks::<LANES>().0[..rows];
-        scale[v] = s.load(&t.columns.scales[v]);
-        bias[v] = s.load(&t.columns.rest.bias[v]);
-    }
-    let mut done = 0;
-    while done < rows {
-        let lines = Lines { first: done, acc: &acc, scale: &scale, bias: &bias };
-        done += if S::REGISTERS >= 32 && rows - done >= 4 {
-            finish_lines::<S, F, NV, 4>(s, t, lines);
-            4
-        } else {
-            finish_lines::<S, F, NV, 1>(s, t, lines);
-            1
-        };
-    }
-}
-
-/// Some rows of whole panels.
-struct Lines<'a, V, const NV: usize> {
-    first: usize,
-    acc: &'a [&'a [[i32; LANES]]; NV],
-    scale: &'a [V; NV],
-    bias: &'a [V; NV],
-}
-
-/// `M` rows of it.
-#[inline(always)]
-fn finish_lines<S: Simd, F: Lanewise, const NV: usize, const M: usize>(s: S, t: &FinishS8, lines: Lines<S::V, NV>) {
-    let Lines { first, acc, scale, bias } = lines;
-    let mut y = [[s.splat(0.0); NV]; M];
-    for r in 0..M {
-        let row = s.splat(t.row_scales[first + r]);
-        for v in 0..NV {
-            y[r][v] = s.load_i32(&acc[v][first + r]).mul_add(row * scale[v], bias[v]);
-        }
-    }
-    put_lines(t.out, (t.at + first * t.stride, t.stride), F::apply_all(s, y));
-}
-
-/// Any tile.
-#[inline(always)]
-fn finish_any<S: Simd>(s: S, t: &FinishS8) {
-    let rows = t.row_scales.len();
-    for p in 0..t.panels {
-        let acc = &t.acc[p * t.acc_stride..][..rows * LANES].as_chunks::<LANES>().0[..rows];
-        let scale = s.load(&t.columns.scales[p]);
-        let bias = s.load(&t.columns.rest.bias[p]);
-        let last = Last {
-            act: t.act,
-            gamma: t.gamma.then(|| s.load(&t.columns.rest.gamma[p])),
-            plus: t.plus,
-            relu_sum: t.relu_sum,
-            cols: LANES.min(t.cols - p * LANES),
-        };
-        for r in 0..rows {
-            let y = s.load_i32(&acc[r]).mul_add(s.splat(t.row_scales[r]) * scale, bias);
-            last.store(s, y, t.out, t.at + r * t.stride + p * LANES);
-        }
+    #[inline(always)]
+    fn to(&self) -> To<'_> {
+        let FinishS8 { panels, row_scales, columns, act, gamma, plus, relu_sum, out, at, stride, cols, .. } = *self;
+        let (rows, gamma) = (row_scales.len(), gamma.then_some(&columns.rest));
+        To { panels, rows, act, gamma, plus, relu_sum, out, at, stride, cols }
     }
 }
